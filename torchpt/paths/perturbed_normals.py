@@ -66,7 +66,7 @@ def perturb_normal(
         slope: derivatives of the bump map's height with respect to u and v, ``(N,)`` each; None for a normal map.
         d: ``(3, N)`` directions of the incoming rays.
         at: the surface points.
-        side: ``(N,)`` -1 where the shading normal is flipped toward the viewer, else 1; None where the model transmits.
+        side: ``(N,)`` -1 where the shading normal is flipped, on the back, else 1; None where the model transmits.
     """
     assert at.tangent is not None
     base = Frame.along(at.ns, at.tangent)  # s along the tangent, t across, n the shading normal
@@ -88,7 +88,8 @@ def perturb_normal(
         x, y, z = x * sign, y * sign, z * sign
     n = at.ns if side is None else at.ns * side
     normal = normalize(affine(base.s * x, base.t, y, n, z))  # x s + y t + z n
-    away = (dot(d, n) * dot(d, normal) <= 0).detach()  # the ray meets the two normals from different sides
+    # A transmitting surface may be seen from either side: there the ray meets the two normals from different ones.
+    away = (dot(d, normal) * (dot(d, n) if side is None else -1.0) <= 0).detach()
     normal = torch.where(away, normalize(affine(base.s * -x, base.t, -y, n, z)), normal)
     flat = dot(normal, normal) == 0  # no texture coordinates, so no slope
     normal = torch.where(flat, n, normal)

@@ -80,12 +80,26 @@ def _footprint(at: Interaction, pixel: Tensor) -> Tensor:
 class Surface:
     """Surface points with their material resolved, of one BSDF model."""
 
-    frame: Frame  # about the shading normal, flipped to the side of wo unless the model transmits
-    side: Tensor | None  # (N,) -1 where the normal was flipped, else 1; None where the model transmits
+    frame: Frame  # about the shading normal, flipped on the back unless the model transmits
+    side: Tensor | None  # (N,) -1 on the back of the geometry, else 1; None where the model transmits
     front_mask: Tensor | None  # (N,) 0 on the back of one-sided surfaces; None where there are none
     parameters: bsdfs.Parameters  # parameters of the BSDF at each lane, textures included
-    wo: Tensor  # (3, N) direction to the previous vertex, in the frame
+    wo: Tensor  # (3, N) direction to the previous vertex, see `local_wo`
     perturbed_normal: PerturbedNormal | None  # None without a normal or bump map
+
+    def local_wo(self, w: Tensor) -> Tensor:
+        """Return the directions ``w (3, N)`` that a viewer lies in, on the side of the geometry that is seen, in the frame.
+
+        Near outlines shading normals turn away from the viewer. What transmits nothing then reflects as if it were seen from
+        the mirror image of ``w``: black instead, it would have a dark rim, which ends where no edge of the geometry is.
+        """
+        return _upper(self.frame, w, self.side)
+
+
+def _upper(frame: Frame, w: Tensor, side: Tensor | None) -> Tensor:
+    """Return :meth:`Surface.local_wo`."""
+    wo = frame.to_local(w)
+    return wo if side is None else torch.stack((wo[0], wo[1], wo[2].abs()))
 
 
 def surface_at(world: World, number: int, d: Tensor, at: Interaction, pixel: Tensor | None = None) -> Surface:
@@ -103,7 +117,7 @@ def surface_at(world: World, number: int, d: Tensor, at: Interaction, pixel: Ten
     point = texture_point_at(world, number, at, pixel)
     ns, side, front_mask, perturbed_normal = at.ns, None, None, None
     if not model.transmits:
-        side = torch.copysign(torch.ones_like(ns[0]), -dot(d, ns).detach())
+        side = _side(d, at)
         two_sided = world.materials.two_sided[number]
         if two_sided is not None:
             front_mask = ((side > 0) | take(two_sided, row)).to(side.dtype)
@@ -118,9 +132,14 @@ def surface_at(world: World, number: int, d: Tensor, at: Interaction, pixel: Ten
         side=side,
         front_mask=front_mask,
         parameters=parameters_at(world, number, row, at, point),
-        wo=frame.to_local(-d),
+        wo=_upper(frame, -d, side),
         perturbed_normal=perturbed_normal,
     )
+
+
+def _side(d: Tensor, at: Interaction) -> Tensor:
+    """Return 1 where rays along ``d (3, N)`` hit the front of the geometry, -1 on its back ``(N,)``."""
+    return torch.copysign(torch.ones_like(d[0]), -dot(d, at.ng).detach())
 
 
 def parameters_at(
@@ -218,7 +237,7 @@ def shading_normal(world: World, number: int, d: Tensor, at: Interaction, point:
         return at.ns
     assert point is not None
     row = take(world.materials.row, at.slot)
-    side = torch.copysign(torch.ones_like(d[0]), -dot(d, at.ns))
+    side = _side(d, at)
     frame, _ = _perturbed_frame(world, textures, row, point, d, at, side)
     return frame.n * side
 

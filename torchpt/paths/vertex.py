@@ -199,7 +199,7 @@ def same_hemisphere(at: Interaction, surface: Surface, world_wi: Tensor, wi: Ten
 
     Args:
         at: the surface points, with the geometric normal on the shape's outside.
-        surface: the points with their material; ``side`` is -1 where its frame is flipped toward the viewer.
+        surface: the points with their material; ``side`` is -1 where its frame is flipped, on the back.
         world_wi: ``(3, n)`` direction in the world.
         wi: the same direction in the surface's frame.
     """

@@ -22,7 +22,7 @@ from torchpt.gradients.edges.bodies import Bodies, Held
 from torchpt.gradients.edges.curves import smooth_faces
 from torchpt.gradients.edges.receivers import MovingFrame, Prefix, prefixes_of
 from torchpt.gradients.edges.traced import Use
-from torchpt.gradients.edges.vertices import Spot, met
+from torchpt.gradients.edges.vertices import TILT, Spot, met
 from torchpt.math.guiding import Round
 from torchpt.math.sampling import Distribution1D, uniform_triangle
 from torchpt.math.vectors import cross, dot, normalize, take
@@ -33,9 +33,6 @@ from torchpt.physics.shapes.geometry import Hit
 from torchpt.scene import Scene
 
 __all__ = ["HorizonSamples", "Horizons", "horizons_of"]
-
-#: Rays along a plane are tilted by so much to the side that counts.
-_TILT = 1e-5
 
 
 @dataclass(frozen=True)
@@ -116,7 +113,7 @@ class Horizons:
             world = traced.wave.context.world
             weight = weight * opacity_at(world, spot.o, spot.d, spot.hit, miss=1.0).double()
         n = spot.n.double() * side
-        o, d = x + n * self.frame.rounding(prim, x), normalize(omega + n * _TILT)
+        o, d = x + n * self.frame.rounding(prim, x), normalize(omega + n * TILT)
         y = met(traced, o, d, traced.of_paths(number, Use.BEHIND))
         r = torch.where(y.hit.prim >= 0, y.hit.t.double(), 1.0)
         moves = self.frame.moving(prim) | self.frame.moving(y.hit.prim)

@@ -7,22 +7,32 @@ Methods*, 1997, section 5.3).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from torchpt.gradients.edges.bodies import Bodies, Held
 from torchpt.gradients.edges.traced import Passing, Traced
-from torchpt.math.vectors import cross, dot, rows, take
+from torchpt.math.sampling import uniform_hemisphere
+from torchpt.math.vectors import Frame, cross, dot, rows, take
 from torchpt.paths.integrators.path import partition
-from torchpt.paths.surface import surface_at
-from torchpt.paths.vertex import sample_bsdf, shading_weight
-from torchpt.physics.shapes import interact
+from torchpt.paths.state import Drawn
+from torchpt.paths.surface import Surface, surface_at
+from torchpt.paths.vertex import has_shading_normals, sample_bsdf, shading_weight
+from torchpt.physics.bsdfs import Bsdf
+from torchpt.physics.samplers import Dimension, Draws
+from torchpt.physics.shapes import interact, offset_origin
 from torchpt.physics.shapes.geometry import Hit, Interaction
 
-__all__ = ["Spot", "met"]
+__all__ = ["TILT", "Spot", "met"]
+
+#: Fraction of directions that are even over the plane of a face that is shaded smooth.
+_EVEN = 0.25
+#: Rays along the plane of a face are tilted by so much to the side that counts.
+TILT = 1e-5
 
 
 @dataclass(frozen=True)
@@ -117,16 +127,34 @@ class Spot:
             kind, back = world.materials.models[model], take(wi, index)
             if kind.smooth:
                 return [torch.zeros_like(at.p), back, torch.zeros_like(back)]
-            surface = surface_at(world, model, -back, at, context.pixel)
-            drawn = sample_bsdf(context, model, at, surface, self.traced.draws(take(key, index), depth))
+            own = None if side is None else take(side, index)
+            n = at.ng * (torch.sign(dot(back, at.ng)) if own is None else own)
+            # Where light arrives in the plane of the normal, its side is not known by the direction.
+            surface = surface_at(world, model, -(back if own is None else back + n * TILT), at, context.pixel)
+            draws = self.traced.draws(take(key, index), depth)
+            drawn = sample_bsdf(context, model, at, surface, draws)
+            if has_shading_normals(world, model) and not kind.transmits:
+                drawn = _over_plane(kind, n, surface, drawn, draws)
             usable = (drawn.pdf > 0) & torch.isfinite(drawn.pdf)
             factor = dot(drawn.d, at.ng).abs() / torch.where(usable, drawn.pdf, 1.0)
-            own = None if side is None else take(side, index)
             value = self._weighed(model, at, drawn.d, back, own) * factor
-            return [drawn.o, drawn.d, torch.where(usable, value, 0.0)]
+            return [offset_origin(world, at, drawn.d), drawn.d, torch.where(usable, value, 0.0)]
 
         self._each([o, d, weight], make)
         return o, d, weight
+
+
+def _over_plane(kind: Bsdf, n: Tensor, surface: Surface, drawn: Drawn, draws: Draws) -> Drawn:
+    """Return BSDF samples of which some are replaced by directions that are even over the plane of normals ``n (3, N)``.
+
+    Surfaces are seen from below their shading normal too, along directions that the BSDF never samples.
+    """
+    other = draws.one(Dimension.LIGHT_DIGITS) < _EVEN
+    even = Frame.about(n).to_world(uniform_hemisphere(draws.two(Dimension.LIGHT).to(n.dtype)))
+    d = torch.where(other, even, drawn.d)
+    pdf = torch.where(other, kind.pdf(surface.parameters, surface.wo, surface.frame.to_local(d)), drawn.pdf)
+    over = (dot(d, n) > 0).to(pdf.dtype)
+    return replace(drawn, d=d, pdf=(1.0 - _EVEN) * pdf + (_EVEN * 0.5 / math.pi) * over)
 
 
 def met(traced: Traced, o: Tensor, d: Tensor, passing: Passing | None = None) -> Spot:

@@ -69,6 +69,11 @@ class _View:
     ray: LightRay | None  # with which the path left its light; None behind the first vertex
 
 
+def _same_side(d: Tensor, at: Interaction, w: Tensor) -> Tensor:
+    """Return values that are positive where light that arrives along ``d`` leaves along ``w`` on the same side ``(N,)``."""
+    return -(dot(d, at.ng) * dot(w, at.ng))
+
+
 class LightPaths(Integrator):
     """Light tracing: the stages of paths that start on lights; :class:`~torchpt.paths.integrators.kinds.bdpt.Bdpt` uses it."""
 
@@ -199,12 +204,12 @@ class LightPaths(Integrator):
             ray = self._ray(context, state.key, context.start_salts)
             first = self._view(context, model, state, at, view.surface, ray).arrival.dvcm
             view = replace(view, arrival=replace(view.arrival, dvcm=torch.where(depth == 1, first, dvcm)))
-        wo = view.surface.frame.to_local(w)
+        wo = view.surface.local_wo(w)
         value, reverse = kind.eval_pdf(view.surface.parameters, wo, view.wi)
         cosine = dot(w, at.ng).abs()
         value = view.throughput * value * (cosine * state.extra["flux"] / view.arrival.cosine)
         if not kind.transmits:
-            value = torch.where(wo[2] > 0, value, 0.0)
+            value = torch.where(_same_side(state.d, at, w) > 0, value, 0.0)
         return End(
             p=at.p,
             o=offset_origin(world, at, w),
@@ -272,14 +277,14 @@ class LightPaths(Integrator):
         if not camera.parallel:
             density = density * safe_reciprocal(square)
         view = self._seen_from(context, model, state, at, front, w)
-        arrival, wo = view.arrival, view.surface.frame.to_local(w)
+        arrival, wo = view.arrival, view.surface.local_wo(w)
         value, reverse = kind.eval_pdf(view.surface.parameters, wo, view.wi)
         u = draws.two(Dimension.PIXEL)
         (column, weight_x), (row, weight_y) = filter.splat(x, u[0].to(plan.dtype)), filter.splat(y, u[1].to(plan.dtype))
         column, row = column - crop[0], row - crop[1]
         seen = ahead & (column >= 0) & (column < crop[2]) & (row >= 0) & (row < crop[3])
         if not kind.transmits:
-            seen = seen & (wo[2] > 0)
+            seen = seen & (_same_side(state.d, at, w) > 0)
         area = density * dot(w, at.ng).abs()  # square pixels for each area of the surface
         scale = area * state.extra["flux"] / arrival.cosine
         if self.weighted:
@@ -309,7 +314,7 @@ class LightPaths(Integrator):
             if sample.eta is not None:
                 weight = weight * (sample.eta * sample.eta)
         if not kind.smooth:
-            value, reverse = kind.eval_pdf(view.surface.parameters, view.surface.frame.to_local(d), view.wi)
+            value, reverse = kind.eval_pdf(view.surface.parameters, view.surface.local_wo(d), view.wi)
             # A failed sample has density 0 though its direction may have a value.
             usable = pdf > 0 if sharp is None else (pdf > 0) & ~sharp
             rough = torch.where(usable, value * (turned / torch.where(usable, pdf, 1.0)), 0.0)
@@ -317,6 +322,8 @@ class LightPaths(Integrator):
         if kind.delta and surface.perturbed_normal is not None:  # light along `d` would meet another normal
             same = dot(view.surface.frame.n, surface.frame.n) > 1.0 - 1e-4
             least = torch.where(torch.isinf(pdf) & ~same, 0.0, least)
+        if not kind.transmits and stages.has_shading_normals(context.world, model):
+            least = torch.minimum(least, _same_side(state.d, at, d))
         drawn = Drawn(
             o=offset_origin(context.world, at, d),
             d=d,

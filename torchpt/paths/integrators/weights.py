@@ -106,9 +106,7 @@ def reverse_pdf(context: StageContext, model: int, at: Interaction, surface: Sur
         wi: likewise.
     """
     kind, other = context.world.materials.models[model], seen_from(context, model, at, surface, wi)
-    back, forth = other.frame.to_local(wi), other.frame.to_local(wo)
-    pdf = kind.pdf(other.parameters, back, forth)
-    return pdf if kind.transmits else torch.where(back[2] > 0, pdf, 0.0)
+    return kind.pdf(other.parameters, other.local_wo(wi), other.frame.to_local(wo))
 
 
 def leaving_dvcm(pdf: Tensor, smooth: bool, number: float) -> Tensor:

@@ -84,8 +84,11 @@ class Preview(FirstSurface):
         surface, direct, shadow = stages.shade(without_sky, model, arriving, at)
         radiance = torch.zeros_like(state.radiance)
         if self.sky is not None:
-            n, v = self.turned(surface.frame.n), self.turned(-state.d)
-            radiance = throughput * shade_under(self.sky, world.materials.models[model], surface.parameters, n, v)
+            kind, wo = world.materials.models[model], -state.d
+            if stages.has_shading_normals(world, model) and not kind.transmits:
+                wo = surface.frame.to_world(surface.wo)  # on the side of the normal
+            n, v = self.turned(surface.frame.n), self.turned(wo)
+            radiance = throughput * shade_under(self.sky, kind, surface.parameters, n, v)
             if surface.front_mask is not None:
                 radiance = radiance * surface.front_mask
         leaving = replace(state, radiance=state.radiance + radiance)
