@@ -59,7 +59,7 @@ OWN: dict[str, dict[str, Any]] = {
 SCENES = ("env_bunny", "veach_mis", "many_lights", "near_light", "cornell_box")
 OURS = ("sobol", "independent")
 THEIRS = ("independent", "multijitter")
-KEYS = {"type": "path", "max_depth": 6, "rr_depth": 5}
+KEYS = {"type": "path", "max_depth": 6, "rr_depth": 5, "dark_rims": True}
 
 Shoot = Callable[[int], Tensor]
 

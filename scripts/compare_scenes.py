@@ -98,7 +98,8 @@ def compare(mitsuba: Any, file: Path, given: argparse.Namespace) -> tuple[dict[s
     old = scene.description.film
     film = {"width": width, "height": max(1, round(width * old["height"] / old["width"])), "filter": "box"}
     limit = given.depth or scene.description.integrator.get("max_depth", -1)
-    options: dict[str, Any] = {"film": film, "integrator": {"type": "path", "max_depth": limit, "rr_depth": 5}}
+    integrator = {"type": "path", "max_depth": limit, "rr_depth": 5, "dark_rims": True}
+    options: dict[str, Any] = {"film": film, "integrator": integrator}
     options["accel"] = given.accel
     torchpt.render(scene, spp=1, seed=0, **options)
     first = time.perf_counter() - start

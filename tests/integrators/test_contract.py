@@ -73,7 +73,7 @@ class Row:
     smooth: dict[str, Any] = field(default_factory=dict)
 
 
-LIT = {"light_choice": "nearest", "clamp": 0, "strict": 1}
+LIT = {"light_choice": "nearest", "dark_rims": 1, "clamp": 0, "strict": 1}
 #: Of integrators with light paths.
 BIDIRECTIONAL: dict[str, Any] = {
     "connections": "all",
@@ -84,6 +84,7 @@ BIDIRECTIONAL: dict[str, Any] = {
     "weighted": 1,
     "light_paths": 0,
     "light_choice": "nearest",
+    "dark_rims": 1,
     "strict": 1,
 }
 ROWS = {
@@ -92,7 +93,9 @@ ROWS = {
         refused={**LIT, "max_depth": -2, "rr_depth": 0, "rr_prob": 1.01, "strategy": "bdpt"},
         smooth={"max_depth": 4},
     ),
-    "direct": Row(accepted={"strategy": "uniform", "strict": True}, refused={**LIT, "strategy": "bdpt"}),
+    "direct": Row(
+        accepted={"strategy": "uniform", "dark_rims": True, "strict": True}, refused={**LIT, "strategy": "bdpt"}
+    ),
     "vcm": Row(
         accepted={"max_depth": 3, "rr_depth": 2, "light_paths": 0.5, "radius": 0.05, "alpha": 0.5},
         refused={**BIDIRECTIONAL, "radius": 0, "alpha": 0},

@@ -30,7 +30,7 @@ from torchpt.scene.formats.description import settings
 
 ROOT = Path(__file__).parent.parent.parent
 SEEDS = 32
-KEYS = {"max_depth": 8, "rr_depth": 5}
+KEYS = {"max_depth": 8, "rr_depth": 5, "dark_rims": True}
 
 
 def turn(angle: float) -> dict[str, Any]:

@@ -201,7 +201,7 @@ def test_against_mitsuba(shape: str, mitsuba: Any, images: Path):
         o64, d64 = take(origin, lanes).double(), take(d, lanes).double()
         hit = Hit(take(t, lanes).double(), take(prim, lanes).long(), take(u, lanes).double(), take(v, lanes).double())
         at = interact(world, o64, d64, hit, follow_ray=True)
-        surface = surface_at(world, 0, d64, at)
+        surface = surface_at(world, 0, d64, at, dark_rims=True)
         wi = surface.frame.to_local(take(w, lanes).double())
         found = world.materials.models[0].eval(surface.parameters, surface.wo, wi)
         assert surface.side is not None

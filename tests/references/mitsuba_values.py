@@ -113,7 +113,7 @@ def _ours(world: World, o: Tensor, d: Tensor, wi: Tensor, hit: Hit) -> dict[str,
         if not len(lanes) or model.smooth:
             continue
         some = rows(at, lanes)
-        surface = surface_at(world, number, d[:, lanes], some)
+        surface = surface_at(world, number, d[:, lanes], some, dark_rims=True)
         local = surface.frame.to_local(wi[:, lanes])
         reflected, pdf = model.eval_pdf(surface.parameters, surface.wo, local)
         share = shading_weight(world, number, some, surface, wi[:, lanes], local)

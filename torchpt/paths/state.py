@@ -102,6 +102,7 @@ class Plan:
     sampler: Points
     strategy: str  # one of STRATEGIES
     rr_prob: float | None  # constant survival probability; None: by throughput
+    dark_rims: bool  # smooth shading is dark where its normal faces away
     dtype: torch.dtype  # of the lanes
     tape: bool  # the stages run on an autograd tape
     attached: bool  # geometry is differentiated too: some parameter moves points

@@ -25,6 +25,7 @@ __all__ = [
     "Surface",
     "TexturePoint",
     "emission_map",
+    "facing_normal",
     "opacity_map",
     "parameters_at",
     "shading_normal",
@@ -81,17 +82,17 @@ class Surface:
     """Surface points with their material resolved, of one BSDF model."""
 
     frame: Frame  # about the shading normal, flipped on the back unless the model transmits
-    side: Tensor | None  # (N,) -1 on the back of the geometry, else 1; None where the model transmits
+    side: Tensor | None  # (N,) -1 on the back, by `facing_normal`, else 1; None where the model transmits
     front_mask: Tensor | None  # (N,) 0 on the back of one-sided surfaces; None where there are none
     parameters: bsdfs.Parameters  # parameters of the BSDF at each lane, textures included
     wo: Tensor  # (3, N) direction to the previous vertex, see `local_wo`
     perturbed_normal: PerturbedNormal | None  # None without a normal or bump map
 
     def local_wo(self, w: Tensor) -> Tensor:
-        """Return the directions ``w (3, N)`` that a viewer lies in, on the side of the geometry that is seen, in the frame.
+        """Return unit directions ``w (3, N)`` to viewers on this side of the surface, in the frame.
 
-        Near outlines shading normals turn away from the viewer. What transmits nothing then reflects as if it were seen from
-        the mirror image of ``w``: black instead, it would have a dark rim, which ends where no edge of the geometry is.
+        Near outlines of smooth shading the normal turns away from the viewer. What transmits nothing then reflects as if it
+        were seen from the mirror image of ``w``: a dark rim would end where the geometry has no edge, and gradients miss that.
         """
         return _upper(self.frame, w, self.side)
 
@@ -102,7 +103,15 @@ def _upper(frame: Frame, w: Tensor, side: Tensor | None) -> Tensor:
     return wo if side is None else torch.stack((wo[0], wo[1], wo[2].abs()))
 
 
-def surface_at(world: World, number: int, d: Tensor, at: Interaction, pixel: Tensor | None = None) -> Surface:
+def surface_at(
+    world: World,
+    number: int,
+    d: Tensor,
+    at: Interaction,
+    pixel: Tensor | None = None,
+    *,
+    dark_rims: bool = False,
+) -> Surface:
     """Return surface points with their materials resolved.
 
     Args:
@@ -111,13 +120,14 @@ def surface_at(world: World, number: int, d: Tensor, at: Interaction, pixel: Ten
         d: directions ``(3, N)`` of the incoming rays.
         at: the surface points.
         pixel: ``(5,)`` footprint of a pixel, as for :func:`texture_point_at`; None: textures are not filtered.
+        dark_rims: as for :func:`facing_normal`.
     """
     model, row = world.materials.models[number], take(world.materials.row, at.slot)
     textures = world.materials.textures[number]
     point = texture_point_at(world, number, at, pixel)
     ns, side, front_mask, perturbed_normal = at.ns, None, None, None
     if not model.transmits:
-        side = _side(d, at)
+        side = _side(d, facing_normal(at, dark_rims=dark_rims))
         two_sided = world.materials.two_sided[number]
         if two_sided is not None:
             front_mask = ((side > 0) | take(two_sided, row)).to(side.dtype)
@@ -137,9 +147,17 @@ def surface_at(world: World, number: int, d: Tensor, at: Interaction, pixel: Ten
     )
 
 
-def _side(d: Tensor, at: Interaction) -> Tensor:
-    """Return 1 where rays along ``d (3, N)`` hit the front of the geometry, -1 on its back ``(N,)``."""
-    return torch.copysign(torch.ones_like(d[0]), -dot(d, at.ng).detach())
+def facing_normal(at: Interaction, *, dark_rims: bool) -> Tensor:
+    """Return the normals ``(3, N)`` by which it is told from which side a surface that transmits nothing is seen.
+
+    ``dark_rims``: the shading normals, as in Mitsuba: near outlines some face away, and show the dark inside of a body.
+    """
+    return at.ns if dark_rims else at.ng
+
+
+def _side(d: Tensor, n: Tensor) -> Tensor:
+    """Return 1 where rays along ``d (3, N)`` meet the side of the normals ``n (3, N)``, else -1 ``(N,)``."""
+    return torch.copysign(torch.ones_like(d[0]), -dot(d, n).detach())
 
 
 def parameters_at(
@@ -237,7 +255,7 @@ def shading_normal(world: World, number: int, d: Tensor, at: Interaction, point:
         return at.ns
     assert point is not None
     row = take(world.materials.row, at.slot)
-    side = _side(d, at)
+    side = _side(d, at.ng)
     frame, _ = _perturbed_frame(world, textures, row, point, d, at, side)
     return frame.n * side
 

@@ -86,7 +86,8 @@ def shade(
         The surface; the light samples and their shadow rays (None where no light is sampled).
     """
     plan, world = context.plan, context.world
-    surface, kind = surface_at(world, model, state.d, at, context.pixel), world.materials.models[model]
+    surface = surface_at(world, model, state.d, at, context.pixel, dark_rims=plan.dark_rims)
+    kind = world.materials.models[model]
     # Light samples never hit a delta lobe, and a `smooth` model has no others.
     if world.lights is None or plan.strategy in ("bsdf", "uniform") or kind.smooth:
         return surface, None, None

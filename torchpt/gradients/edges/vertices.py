@@ -95,12 +95,16 @@ class Spot:
         self._each([out], make)
         return out
 
+    def _seen_from(self, w: Tensor, model: int, at: Interaction) -> Surface:
+        context = self.traced.wave.context
+        return surface_at(context.world, model, -w, at, context.pixel, dark_rims=context.plan.dark_rims)
+
     def _weighed(self, model: int, at: Interaction, wo: Tensor, wi: Tensor, side: Tensor | None) -> Tensor:
         world = self.traced.wave.context.world
         kind = world.materials.models[model]
         if kind.smooth:
             return torch.zeros_like(wo)
-        surface = surface_at(world, model, -wo, at, self.traced.wave.context.pixel)
+        surface = self._seen_from(wo, model, at)
         local = surface.frame.to_local(wi)
         if side is not None:
             counts = torch.sign(local[2]) * (side if surface.side is None else side * surface.side) > 0
@@ -130,7 +134,7 @@ class Spot:
             own = None if side is None else take(side, index)
             n = at.ng * (torch.sign(dot(back, at.ng)) if own is None else own)
             # Where light arrives in the plane of the normal, its side is not known by the direction.
-            surface = surface_at(world, model, -(back if own is None else back + n * TILT), at, context.pixel)
+            surface = self._seen_from(back if own is None else back + n * TILT, model, at)
             draws = self.traced.draws(take(key, index), depth)
             drawn = sample_bsdf(context, model, at, surface, draws)
             if has_shading_normals(world, model) and not kind.transmits:

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from torchpt.physics.world import World
 
 __all__ = [
+    "DARK_RIMS",
     "DEPTHS",
     "ENDLESS",
     "LIGHT_CHOICE",
@@ -82,6 +83,9 @@ LIGHT_CHOICE: dict[str, Spec] = {
     ),
 }
 STRICT: dict[str, Spec] = {"strict": Flag(False, doc="whether a sample that is not finite is an error")}
+DARK_RIMS: dict[str, Spec] = {
+    "dark_rims": Flag(False, doc="whether smooth shading is dark where its normal faces away, as in Mitsuba"),
+}
 SAMPLES: dict[str, Spec] = {
     "clamp": Scalar(None, above=0.0, words="null or a number > 0", doc="largest component of a sample; biased"),
     **STRICT,
@@ -140,6 +144,7 @@ class Integrator(FrozenConfig):
             without a parameter of the name.
         rr_prob: constant survival probability of roulette; None: by throughput.
         light_choice: which of many lights is sampled, one of :data:`torchpt.physics.lights.LIGHT_SAMPLERS`.
+        dark_rims: True: smooth shading is dark where its normal faces away.
         clamp: largest component of a sample; None: unbounded.
         strict: True: a sample that is not finite is an error.
     """
@@ -157,6 +162,7 @@ class Integrator(FrozenConfig):
     strategy: str = "mis"
     rr_prob: float | None = None
     light_choice: str = "auto"
+    dark_rims: bool = False
     clamp: float | None = None
     strict: bool = False
 
@@ -173,7 +179,13 @@ class Integrator(FrozenConfig):
     def plan(self, sampler: Points, dtype: torch.dtype, *, tape: bool = False, attached: bool = False) -> Plan:
         """Return the static configuration of the stages; the arguments are fields of :class:`torchpt.paths.state.Plan`."""
         return Plan(
-            sampler=sampler, strategy=self.strategy, rr_prob=self.rr_prob, dtype=dtype, tape=tape, attached=attached
+            sampler=sampler,
+            strategy=self.strategy,
+            rr_prob=self.rr_prob,
+            dark_rims=self.dark_rims,
+            dtype=dtype,
+            tape=tape,
+            attached=attached,
         )
 
     def light_walk(self) -> Integrator | None:

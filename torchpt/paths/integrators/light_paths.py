@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchpt.math.vectors import dot, largest, safe_reciprocal
 from torchpt.paths import vertex as stages
-from torchpt.paths.integrators.base import DEPTHS, ENDLESS, Integrator, Limits
+from torchpt.paths.integrators.base import DARK_RIMS, DEPTHS, ENDLESS, Integrator, Limits
 from torchpt.paths.integrators.weights import (
     FIELDS,
     Arrival,
@@ -34,6 +34,7 @@ from torchpt.paths.state import (
     Field,
     PathState,
     Photon,
+    Plan,
     Shadow,
     Splat,
     StageContext,
@@ -42,7 +43,7 @@ from torchpt.paths.state import (
     VertexOutput,
 )
 from torchpt.paths.store import BLOCKS
-from torchpt.paths.surface import Surface, surface_at
+from torchpt.paths.surface import Surface, facing_normal, surface_at
 from torchpt.paths.wave import camera_state
 from torchpt.physics import lights
 from torchpt.physics.lights.emission import LightRay, emit, light_weight
@@ -69,9 +70,10 @@ class _View:
     ray: LightRay | None  # with which the path left its light; None behind the first vertex
 
 
-def _same_side(d: Tensor, at: Interaction, w: Tensor) -> Tensor:
-    """Return values that are positive where light that arrives along ``d`` leaves along ``w`` on the same side ``(N,)``."""
-    return -(dot(d, at.ng) * dot(w, at.ng))
+def _same_side(plan: Plan, d: Tensor, at: Interaction, w: Tensor) -> Tensor:
+    """Return values ``(N,)`` that are positive where light along ``d (3, N)`` meets the side that is seen from ``w (3, N)``."""
+    n = facing_normal(at, dark_rims=plan.dark_rims)
+    return -(dot(d, n) * dot(w, n))
 
 
 class LightPaths(Integrator):
@@ -80,6 +82,7 @@ class LightPaths(Integrator):
     name = "light_paths"
     parameters: ClassVar = {
         **DEPTHS,
+        **DARK_RIMS,
         "fraction": Scalar(1.0, above=0.0, high=1.0, doc="number of light paths for each camera path"),
         "weighted": Flag(True, doc="whether splats are weighted among all strategies"),
         "joined": Flag(True, doc="whether vertices are joined to the camera"),
@@ -136,7 +139,7 @@ class LightPaths(Integrator):
         world, state, hit = context.world, vertex.state, vertex.hit
         kind = world.materials.models[model]
         at = interact(world, state.o, state.d, hit, follow_ray=context.follow_ray)
-        surface = surface_at(world, model, state.d, at, context.pixel)
+        surface = surface_at(world, model, state.d, at, context.pixel, dark_rims=context.plan.dark_rims)
         # At the first vertex: the ray with which the path left its light, drawn again.
         ray = None if context.start_salts is None else self._ray(context, state.key, context.start_salts)
         front = self._view(context, model, state, at, surface, ray)
@@ -194,7 +197,7 @@ class LightPaths(Integrator):
         world, state = context.world, vertex.state
         kind = world.materials.models[model]
         at = interact(world, state.o, state.d, vertex.hit)
-        surface = surface_at(world, model, state.d, at, context.pixel)
+        surface = surface_at(world, model, state.d, at, context.pixel, dark_rims=context.plan.dark_rims)
         dvcm = state.extra["dvcm"]
         to = p - at.p
         w = to * safe_reciprocal(dot(to, to).sqrt())
@@ -209,7 +212,7 @@ class LightPaths(Integrator):
         cosine = dot(w, at.ng).abs()
         value = view.throughput * value * (cosine * state.extra["flux"] / view.arrival.cosine)
         if not kind.transmits:
-            value = torch.where(_same_side(state.d, at, w) > 0, value, 0.0)
+            value = torch.where(_same_side(context.plan, state.d, at, w) > 0, value, 0.0)
         return End(
             p=at.p,
             o=offset_origin(world, at, w),
@@ -284,7 +287,7 @@ class LightPaths(Integrator):
         column, row = column - crop[0], row - crop[1]
         seen = ahead & (column >= 0) & (column < crop[2]) & (row >= 0) & (row < crop[3])
         if not kind.transmits:
-            seen = seen & (_same_side(state.d, at, w) > 0)
+            seen = seen & (_same_side(context.plan, state.d, at, w) > 0)
         area = density * dot(w, at.ng).abs()  # square pixels for each area of the surface
         scale = area * state.extra["flux"] / arrival.cosine
         if self.weighted:
@@ -323,7 +326,7 @@ class LightPaths(Integrator):
             same = dot(view.surface.frame.n, surface.frame.n) > 1.0 - 1e-4
             least = torch.where(torch.isinf(pdf) & ~same, 0.0, least)
         if not kind.transmits and stages.has_shading_normals(context.world, model):
-            least = torch.minimum(least, _same_side(state.d, at, d))
+            least = torch.minimum(least, _same_side(plan, state.d, at, d))
         drawn = Drawn(
             o=offset_origin(context.world, at, d),
             d=d,

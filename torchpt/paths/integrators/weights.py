@@ -91,7 +91,7 @@ def seen_from(context: StageContext, model: int, at: Interaction, surface: Surfa
     """
     if surface.perturbed_normal is None:
         return surface
-    return surface_at(context.world, model, -w, at, context.pixel)
+    return surface_at(context.world, model, -w, at, context.pixel, dark_rims=context.plan.dark_rims)
 
 
 def reverse_pdf(context: StageContext, model: int, at: Interaction, surface: Surface, wo: Tensor, wi: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchpt.math.vectors import dot, largest, safe_reciprocal
 from torchpt.paths import vertex as stages
-from torchpt.paths.integrators.base import DEPTHS, LIGHT_CHOICE, STRICT, Limits
+from torchpt.paths.integrators.base import DARK_RIMS, DEPTHS, LIGHT_CHOICE, STRICT, Limits
 from torchpt.paths.integrators.kinds.path import Path
 from torchpt.paths.integrators.light_paths import LightPaths
 from torchpt.paths.integrators.merging import merged_light
@@ -75,6 +75,7 @@ class Bdpt(PathIntegrator):
             doc="whether each vertex of a camera path is connected to one of the light path",
         ),
         **LIGHT_CHOICE,
+        **DARK_RIMS,
         **STRICT,
     }
     splats = True
@@ -105,7 +106,7 @@ class Bdpt(PathIntegrator):
         # Light samples alone have no weights, and draw dim parts of environment maps too.
         alone = self.strategy == "light" and not self.weighted
         strategy = "light" if alone else "mis"
-        return Plan(sampler=sampler, strategy=strategy, rr_prob=self.rr_prob, dtype=dtype, tape=tape, attached=attached)
+        return replace(super().plan(sampler, dtype, tape=tape, attached=attached), strategy=strategy)
 
     def _scale(self, strategy: str, among_all: Tensor, weight: Tensor | None) -> Tensor | float:
         """Return the factor on contributions of a strategy, which have its weight among those of ``path``.
@@ -138,6 +139,7 @@ class Bdpt(PathIntegrator):
             max_depth=0 if self.strategy in ("bsdf", "light") else self.max_depth,
             rr_depth=self.rr_depth,
             rr_prob=self.rr_prob,
+            dark_rims=self.dark_rims,
             fraction=self.light_paths,
             weighted=self.strategy == "mis" or self.weighted,
             joined=self.strategy in ("mis", "light_paths"),

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchpt.core.tree import leaves
 from torchpt.math.vectors import dot
 from torchpt.paths import vertex as stages
-from torchpt.paths.integrators.base import LIGHT_CHOICE, SAMPLES
+from torchpt.paths.integrators.base import DARK_RIMS, LIGHT_CHOICE, SAMPLES
 from torchpt.paths.integrators.first_surface import FirstSurface, FirstSurfaceIntegrator
 from torchpt.paths.integrators.split_sum import shade_under
 from torchpt.paths.state import StageContext, VertexInput, VertexOutput
@@ -32,7 +32,11 @@ class Ibl(FirstSurfaceIntegrator):
     """A preview: the first surface under the environment by split sum (unshadowed), and under other lights."""
 
     name = "ibl"
-    parameters: ClassVar = {**LIGHT_CHOICE, **SAMPLES}  # SAMPLES: `clamp` and `strict`, which treat each sample
+    parameters: ClassVar = {
+        **LIGHT_CHOICE,
+        **DARK_RIMS,
+        **SAMPLES,
+    }  # SAMPLES: `clamp` and `strict`, which treat each sample
     strategy = "light"
 
     def first(self, world: World) -> Preview:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from torchpt.paths.integrators.base import DEPTHS, LIGHT_CHOICE, SAMPLES, STRATEGY, Limits
+from torchpt.paths.integrators.base import DARK_RIMS, DEPTHS, LIGHT_CHOICE, SAMPLES, STRATEGY, Limits
 from torchpt.paths.integrators.path import PathIntegrator
 from torchpt.spec import Refused
 
@@ -20,6 +20,7 @@ class Path(PathIntegrator):
         **DEPTHS,
         **STRATEGY,
         **LIGHT_CHOICE,
+        **DARK_RIMS,
         **SAMPLES,
     }
 

@@ -334,6 +334,8 @@ class Importer:
         if integrators:
             integrator = self.build(INTEGRATORS, integrators[-1], UNKNOWN_INTEGRATOR)
         layers = integrator.pop("aovs", [])
+        if integrator["type"] != "aov":
+            integrator = integrator | {"dark_rims": True}
         if layers:
             film = film | {"aovs": layers}
         return {
