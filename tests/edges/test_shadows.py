@@ -130,3 +130,19 @@ def test_agrees_with_central_differences(case: str) -> None:
     error = float((a.var() / 6 + b.var() / 6).sqrt())
     assert abs(float(a.mean() - b.mean())) < 3.5 * error + 0.02 * abs(float(b.mean()))
     assert float(a.std()) / 6**0.5 < 0.1 * abs(float(b.mean()))
+
+
+def test_a_blocker_under_a_map_with_a_sun() -> None:
+    """Edges draw directions of a map alone, however the integrator does: such a map has a density for MIS of its own."""
+    texels = torch.full((32, 64, 3), 0.02)
+    texels[14:16, 32:34] = 40.0  # from above
+    light = {"sky": {"type": "envmap", "data": texels.tolist()}}
+    blocker = {"type": "rectangle", "transform": [{"scale": 0.5}, {"translate": [0.3, 0.2, 1]}]}
+    weight = torch.zeros(8, 8, 1, dtype=torch.float64)
+    weight[:, 4:] = 1.0
+    found = []
+    for strategy in ("mis", "light"):
+        scene = scene_of(light, blocker, integrator={"type": "path", "max_depth": 2, "strategy": strategy})
+        found.append(slope(scene, "shapes.it.to_world", weight, spp=64, edge_spp=128)[0, 3])
+    assert abs(float(found[0])) > 0.5
+    assert float(found[0]) == pytest.approx(float(found[1]), rel=0.03)

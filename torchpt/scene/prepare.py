@@ -135,6 +135,7 @@ def make_wave(
     like: Wave | None = None,
     rays: tuple[Tensor, Tensor] | None = None,
     tree: bool = False,
+    alone: bool = False,
 ) -> Wave:
     """Build the wave of a render.
 
@@ -148,6 +149,7 @@ def make_wave(
         like: a wave that differs in the camera's parameters only; its world and search are used again.
         rays: origins and directions ``(..., 3)`` in the scene's coordinates, in place of the camera's.
         tree: True to search a tree even where packets would be faster.
+        alone: True where lights are sampled alone too, whatever the integrator does.
 
     Raises:
         SceneError: a direction that is zero, or a ray that is not finite.
@@ -161,7 +163,7 @@ def make_wave(
         uv = any(layer.uv for layer in surface_layers(settings).values())  # an AOV shows texture coordinates
         with one_thread() if scene.numbers <= QUICK_NUMBERS else nullcontext():
             world, geometry = scene.world(
-                dtype, world_params, uv=uv, choice=settings.light_choice, alone=settings.lights_alone
+                dtype, world_params, uv=uv, choice=settings.light_choice, alone=alone or settings.lights_alone
             )
             threads = None if settings.render.threads == "auto" else int(settings.render.threads)
             surfaces_move = any(
