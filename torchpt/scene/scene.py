@@ -121,6 +121,7 @@ class Scene:
                 with np.errstate(over="ignore"):  # infinite in float32: the check of the world says so
                     tensor = torch.from_numpy(value.astype(np.float64 if positions else np.float32, order="C"))
             self.params[name] = tensor.to(device)
+        trim_heap()  # of files as they were read
         after = meter.peak()
         #: Peak bytes while the scene was read, above those after import; 0 where unknown, and where no new peak was reached.
         self.peak = after - meter.base() if after > before else 0
@@ -444,6 +445,7 @@ class Scene:
         made = search.build(geometry, *key, before=self._latest_accels.get(key))
         if made.refits:  # a kind that later ones can be refitted from
             self._latest_accels[key] = made
+        trim_heap()
         return made
 
     def camera(self, film: Film, params: Mapping[str, Tensor], dtype: torch.dtype) -> Camera:

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torchpt.core.errors import SceneError
+from torchpt.core.tree import leaves
 from torchpt.math.vectors import cross, dot, normalize
 from torchpt.physics.parts import Copy, Part
 from torchpt.physics.shapes.geometry import KINDS, Geometry, Instances, Quadrics
@@ -151,6 +152,7 @@ class Primitives:
 
     kinds: tuple[type[Primitive], ...]  # those that occur
     sizes: list[int]  # number of primitives of each part
+    taped: list[bool]  # whether each part requires gradients
     counts: tuple[int, int, int, int, int]
     p0: Tensor  # (3, P) first corner or centre
     p1: Tensor  # (3, P) as in Geometry
@@ -256,6 +258,7 @@ def primitives_of(
     return Primitives(
         kinds=kinds,
         sizes=sizes,
+        taped=[any(tensor.requires_grad for tensor in leaves(of_part)) for of_part in corners],
         counts=counts,
         p0=p0,
         p1=p1,
