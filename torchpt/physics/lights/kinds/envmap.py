@@ -129,14 +129,14 @@ def build(
     top = halves[0].diff()  # near the south pole the other one keeps its digits
     heights = torch.where(halves[0, 1:] < 0.5, top, -halves[1].diff())
     with torch.no_grad():
-        light = luminance(planes).clamp_min(0.0).view(height, width)
+        light = _luminances(texels)
         zero = light.new_zeros(())
         mean = sum_all(_weights(light, heights))
         black = not bool(mean > 0)
         compensated = plain = None
         if not black and compensation is not False:
             floor = mean.to(light.dtype)
-            above = _weights((light - floor).clamp_min(0.0), heights)
+            above = _weights(light, heights, floor)
             if bool(sum_all(above) > 0) and (compensation or _uneven(above, mean, heights)):
                 compensated = _grid(above, floor)
             del above  # a map may be large
@@ -159,12 +159,24 @@ def build(
     )
 
 
-def _weights(values: Tensor, heights: Tensor) -> Tensor:
-    """Return integrals ``(H - 1, W)`` float64 over the cells of values ``(H, W)`` at the texels; the sphere has measure 1."""
+def _luminances(texels: Tensor) -> Tensor:
+    """Return the luminances ``(H, W)`` of texels ``(H, W, 3)``, at least 0."""
+    found = texels.new_empty(texels.shape[:2])
+    for rows, light in zip(texels.split(_ROWS), found.split(_ROWS), strict=True):  # a map may be large
+        torch.clamp_min(luminance(rows.movedim(-1, 0)), 0.0, out=light)
+    return found
+
+
+def _weights(values: Tensor, heights: Tensor, floor: Tensor | None = None) -> Tensor:
+    """Return integrals ``(H - 1, W)`` float64 over the cells of values ``(H, W)`` at the texels; the sphere has measure 1.
+
+    With a ``floor`` the values are what is above it, or 0.
+    """
     found = torch.empty(len(values) - 1, values.shape[1], dtype=torch.float64, device=values.device)
     for first in range(0, len(found), _ROWS):  # a map may be large, and so would be what is between
         block = found[first : first + _ROWS]
-        v = values[first : first + len(block) + 1].double()
+        v = values[first : first + len(block) + 1]
+        v = (v if floor is None else (v - floor).clamp_min(0.0)).double()
         v = v.roll(-1, 1).add_(v)
         torch.add(v[:-1], v[1:], out=block)
     return found.mul_(0.25).mul_((heights / values.shape[1])[:, None])
