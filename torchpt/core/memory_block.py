@@ -22,9 +22,10 @@ class MemoryBlock:
 
     def add(self, array: NDArray[np.float32]) -> Tensor:
         """Return a tensor with the values of ``array``, after those that were added before."""
-        # `set_` and no view of the block: views share their count of changes in place.
-        added = torch.empty(0).set_(self._numbers.untyped_storage(), self._end, array.shape)
-        self._end += array.size
+        start, self._end = self._end, self._end + array.size
+        view = self._numbers[start : self._end].view(array.shape)
+        # A tensor of its own in the same memory: views share their count of changes in place.
+        added = torch.empty(0).set_(view.untyped_storage(), start, view.shape, view.stride())
         return added.copy_(torch.from_numpy(array))
 
 

@@ -202,7 +202,9 @@ def _stored(levels: Sequence[Tensor], dtype: torch.dtype, device: torch.device) 
     block = common_block(levels)
     even = all(level.stride(0) == level.shape[1] * level.stride(1) for level in levels)  # a row follows the one above
     if block is not None and even and (block.dtype, block.device) == (dtype, device):
-        return block, [_layout(level, level.storage_offset(), level.stride(1), level.stride(2)) for level in levels]
+        return block, [
+            _layout(level, int(level.storage_offset()), level.stride(1), level.stride(2)) for level in levels
+        ]
     sizes = [level.numel() for level in levels]
     layouts = [
         _layout(level, end - level.numel(), level.shape[2], 1)

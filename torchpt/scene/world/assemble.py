@@ -220,7 +220,7 @@ class _Assembly(Pieced):
         materials |= {name: self.lane_material(name) for name in materials if materials[name].opacity is not None}
         return opacity_of(self.owners, materials, self.slot_counts(), self.dtype, self.device)
 
-    @piece
+    @passing_piece
     def dark(self) -> Tensor:
         """Return ``(P + I,)`` 0 where a surface emits, else 1; instances cannot emit."""
         emits = [int(part.emission is None) for part in self.parts]

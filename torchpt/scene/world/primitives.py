@@ -159,7 +159,6 @@ class Primitives:
     p2: Tensor
     e1: Tensor  # (3, P) edges from p0; the first two axes of a sphere or quadric
     e2: Tensor
-    edge_cross: Tensor  # (3, P) cross product of the edges
     sign: Tensor  # (P,) -1 where a shape's normals are flipped
     normal: Tensor
     normals: tuple[Tensor, Tensor, Tensor] | None
@@ -169,10 +168,7 @@ class Primitives:
 
     def detached(self) -> Primitives:
         """Return detached primitives."""
-        tensors = {
-            name: getattr(self, name)
-            for name in ("p0", "p1", "p2", "e1", "e2", "edge_cross", "sign", "normal", "bound")
-        }
+        tensors = {name: getattr(self, name) for name in ("p0", "p1", "p2", "e1", "e2", "sign", "normal", "bound")}
         return replace(self, **{name: value.detach() for name, value in tensors.items()})
 
     def spread(self, values: Sequence[int]) -> Tensor:
@@ -220,8 +216,7 @@ def primitives_of(
     e2 = p2 - p0 if planar is None else torch.where(planar, p2 - p0, p2)
     signs = torch.tensor([-1.0 if part.flip else 1.0 for part in parts], dtype=dtype, device=device)
     sign = torch.repeat_interleave(signs, torch.tensor(sizes, dtype=torch.int64, device=device))
-    edge_cross = cross(e1, e2)
-    normal = normalize(edge_cross) * sign
+    normal = normalize(cross(e1, e2)) * sign
     normals = None
     if any(c.normals is not None for c in corners):
         faces = normal.split(sizes, 1)
@@ -265,7 +260,6 @@ def primitives_of(
         p2=p2,
         e1=e1,
         e2=e2,
-        edge_cross=edge_cross,
         sign=sign,
         normal=normal,
         normals=normals,
