@@ -19,6 +19,7 @@ from torchpt.core.errors import SceneError
 from torchpt.math.sampling import cosine_hemisphere
 from torchpt.physics import bsdfs, cameras, lights, shapes, textures
 from torchpt.physics.bsdfs.records import BsdfSample
+from torchpt.physics.textures.atlas import Atlas
 from torchpt.spec import parameters_of
 
 RED = "materials.red.reflectance"
@@ -101,6 +102,30 @@ def test_a_copy_renders_the_same_and_goes_its_own_way(how, rendered):
     made.params[RED] = torch.tensor([0.0, 1.0, 0.0])
     assert not torchpt.render(made).equal(before)
     assert torchpt.render(scene).equal(before)
+
+
+def test_a_world_reads_texels_of_its_scene_and_pickles_hold_each_once():
+    image, white = (torch.full((64, 64, 3), value).numpy() for value in (0.25, 1.0))
+    blocks = {name: {"type": "image", "data": texels} for name, texels in (("a", image), ("b", white))}
+    materials = {name: {"type": "diffuse", "reflectance": block} for name, block in blocks.items()}
+    floor = SCENE["shapes"]["floor"]
+    meshes = {name: {**floor, "material": name} for name in blocks}
+    scene = torchpt.load({**SCENE, "textures": {}, "materials": materials, "shapes": meshes}, "cpu")
+    world, _ = scene.world(torch.float32)
+    (atlas,) = world.textures.tables
+    one, other = (scene.params[f"materials.{name}.reflectance"] for name in blocks)
+    assert (
+        isinstance(atlas, Atlas)
+        and atlas.texels.data_ptr() == one.data_ptr()
+        and atlas.texels.numel() == 2 * 3 * 64 * 64
+    )
+    version, before = other._version, torchpt.render(scene)
+    one.fill_(0.75)
+    assert other._version == version and not torchpt.render(scene).equal(before)
+    # The description has the arrays, the build and the parameters have tensors.
+    assert len(pickle.dumps(scene)) < 3.5 * atlas.texels.nbytes
+    made = pickle.loads(pickle.dumps(scene))
+    assert torchpt.render(made).equal(torchpt.render(scene))
 
 
 def test_a_copy_shares_tensors_and_a_deep_copy_does_not():

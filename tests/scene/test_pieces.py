@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import sys
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
@@ -12,7 +14,10 @@ from torch import Tensor
 import torchpt
 from torchpt.core.tree import leaves
 from torchpt.extend import BsdfSample, Parameters, cosine_hemisphere
+from torchpt.physics.parts import Part
+from torchpt.physics.shapes.primitive import Corners
 from torchpt.scene.world import pieces
+from torchpt.scene.world.primitives import corners_of_all
 
 QUAD = {"vertices": [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], "faces": [[0, 1, 2], [0, 2, 3]]}
 UVS = {"uvs": [[0, 0], [1, 0], [1, 1], [0, 1]]}
@@ -113,6 +118,25 @@ def test_pieces_of_unchanged_parameters_are_the_same_tensors() -> None:
     assert first.materials.row is own.materials.row and first.materials is not own.materials
     again, same_geometry = scene.world(torch.float32, {name: colour.clone()})
     assert again is first and same_geometry is geometry
+
+
+def test_corners_are_kept_in_no_world_and_made_once_for_each_geometry(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[int] = []
+
+    def counted(parts: Sequence[Part], *rest: Any) -> list[Corners]:
+        made.append(len(parts))
+        return corners_of_all(parts, *rest)
+
+    monkeypatch.setattr(sys.modules["torchpt.scene.world.assemble"], "corners_of_all", counted)
+    scene = load()
+    scene.world(torch.float32)
+    assert len(made) == 1
+    for name in ("shapes.lamp.emission", "lights.bulb.intensity", "materials.white.reflectance"):
+        scene.world(torch.float32, {name: changed(scene.params[name])})
+    assert len(made) == 1  # the light table asks for the primitives alone
+    name = "shapes.wall.vertices"
+    scene.world(torch.float32, {name: changed(scene.params[name])})
+    assert len(made) == 2
 
 
 def test_pieces_on_a_tape_are_not_kept() -> None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 
+from torchpt.core.memory_block import MemoryBlock
 from torchpt.physics.textures.atlas import WRAPS, Atlas, ImageNode, atlas_of, look_up, slope
 
 CPU = torch.device("cpu")
@@ -218,3 +220,18 @@ def test_gradients_of_filtered_look_ups():
         )
 
     assert torch.autograd.gradcheck(value, (texels, heights, uv, footprint), fast_mode=True)
+
+
+def test_images_in_one_block_are_read_where_they_are():
+    images = {name: image.float() for name, image in IMAGES.items()}
+    block = MemoryBlock(sum(image.numel() for image in images.values()))
+    placed = {name: block.add(image.numpy()) for name, image in images.items()}
+    nodes = [ImageNode(name, channel, "mirror", False, SAME, PLAIN) for name in images for channel in (None, 0)]
+    copied, shared = (atlas_of(nodes, of, torch.float32, CPU) for of in (images, placed))
+    assert shared.texels.data_ptr() == placed["small"].data_ptr() != copied.texels.data_ptr()
+    for k, node in enumerate(nodes):
+        index, uv, coloured = torch.full((50,), k), points(50).float(), node.channel is None
+        assert torch.equal(look_up(shared, index, uv, coloured), look_up(copied, index, uv, coloured))
+    # Levels of a mipmap are computed, and another dtype is a copy.
+    for others, dtype in (([replace(node, filtered=True) for node in nodes], torch.float32), (nodes, torch.float64)):
+        assert atlas_of(others, placed, dtype, CPU).texels.data_ptr() != placed["small"].data_ptr()

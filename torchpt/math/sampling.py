@@ -198,27 +198,31 @@ class Distribution2D:
     blocks: Tensor | None
 
     @staticmethod
-    def of(weights: Tensor) -> Distribution2D:
-        """Build the distribution of non-negative weights ``(R, C)``, at least one of them positive."""
-        w = weights.detach().double()
-        num_rows = w.shape[0]
-        count, blocks = 1 + w.numel(), None
+    def room(rows: int, columns: int, device: torch.device) -> Tensor:
+        """Return memory ``(rows, columns)`` float64 for weights, which :meth:`within` overwrites: grids may be large."""
+        count = 1 + rows * columns
         rest = -count % _BLOCK if count > _SMALL else 0
-        columns = w.new_empty(count + rest)
-        columns[0] = 0.0
-        columns[count:] = torch.inf
-        along = columns[1:count].view(w.shape)  # over the columns of each row
-        torch.cumsum(w, 1, out=along)
+        memory = torch.empty(count + rest, dtype=torch.float64, device=device)
+        memory[0] = 0.0
+        memory[count:] = torch.inf
+        return memory[1:count].view(rows, columns)
+
+    @staticmethod
+    def within(weights: Tensor) -> Distribution2D:
+        """Build the distribution of non-negative weights, at least one of them positive, in the memory of :meth:`room`."""
+        memory = weights.new_empty(0).set_(weights.untyped_storage())
+        along = weights.cumsum_(1)  # over the columns of each row
         total = along[:, -1:].clone()
-        # In place, as grids may be large. A row without weight is never drawn.
+        # A row without weight is never drawn.
         along.div_(torch.where(total > 0, total, 1.0)).masked_fill_(total <= 0, 1.0)
-        along += torch.arange(num_rows, dtype=w.dtype, device=w.device)[:, None]
+        along += torch.arange(len(along), dtype=along.dtype, device=along.device)[:, None]
         down = torch.cumsum(total[:, 0], 0)
-        zero = down.new_zeros(1)
-        width = torch.tensor(w.shape[1], dtype=torch.int64, device=w.device)
-        if count > _SMALL:
-            blocks = columns[::_BLOCK].contiguous()
-        return Distribution2D(rows=torch.cat((zero, down / down[-1])), columns=columns, width=width, blocks=blocks)
+        return Distribution2D(
+            rows=torch.cat((down.new_zeros(1), down / down[-1])),
+            columns=memory,
+            width=torch.tensor(along.shape[1], dtype=torch.int64, device=along.device),
+            blocks=memory[::_BLOCK].contiguous() if along.numel() >= _SMALL else None,
+        )
 
     def sample(self, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Draw rows and columns ``(N,)`` int64 by ``u (2, N)`` in ``[0, 1)``; return them and remapped ``u``.

@@ -25,6 +25,7 @@ from torchpt import search
 from torchpt.core.autograd import outside_transforms
 from torchpt.core.errors import SceneError, example_names
 from torchpt.core.memory import MemoryMeter, mb, retry_out_of_memory, trim_heap
+from torchpt.core.memory_block import MemoryBlock, with_own_memory
 from torchpt.core.threads import outside_inference_mode, warm_up
 from torchpt.core.tree import moved
 from torchpt.physics.bsdfs import Bsdf
@@ -109,13 +110,18 @@ class Scene:
         far = bool(self._built.centre.any())
         self.params: dict[str, Tensor] = {}
         parameters = self._built.parameters
+        # Texels may be large: they are kept once, where a world reads them.
+        block = MemoryBlock(sum(value.size for value in parameters.values() if value.dtype == np.float32))
         for name, value in parameters.items():
             positions = far and self.spec(name).holds_positions
-            with np.errstate(over="ignore"):  # infinite in float32: the check of the world says so
-                tensor = torch.from_numpy(value.astype(np.float64 if positions else np.float32, order="C"))
             if value.dtype == np.float32:
-                parameters[name] = tensor.numpy()  # texels may be large: they are kept once
+                tensor = block.add(value)
+                parameters[name] = tensor.numpy()
+            else:
+                with np.errstate(over="ignore"):  # infinite in float32: the check of the world says so
+                    tensor = torch.from_numpy(value.astype(np.float64 if positions else np.float32, order="C"))
             self.params[name] = tensor.to(device)
+        trim_heap()  # of files as they were read
         after = meter.peak()
         #: Peak bytes while the scene was read, above those after import; 0 where unknown, and where no new peak was reached.
         self.peak = after - meter.base() if after > before else 0
@@ -218,7 +224,7 @@ class Scene:
     def __getstate__(self) -> dict[str, Any]:
         """Return the state to pickle; unpickling reads no files."""
         state = {name: getattr(self, name) for name in _COPIED_ATTRIBUTES}
-        return state | {"params": {name: _leaf(value) for name, value in self.params.items()}}
+        return state | {"params": {name: with_own_memory(_leaf(value)) for name, value in self.params.items()}}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         warm_up()
@@ -439,6 +445,7 @@ class Scene:
         made = search.build(geometry, *key, before=self._latest_accels.get(key))
         if made.refits:  # a kind that later ones can be refitted from
             self._latest_accels[key] = made
+        trim_heap()
         return made
 
     def camera(self, film: Film, params: Mapping[str, Tensor], dtype: torch.dtype) -> Camera:

@@ -1,8 +1,9 @@
 """One atlas for all images of a scene, and look-ups into it that are differentiable in texels and coordinates.
 
-An image is stored in the atlas as planes of floats, one a channel. A node defines how it is read: channel, wrap mode, filter,
-transform of texture coordinates. Texel centres are at ``(i + 1/2) / size``; row 0 is ``v = 0`` (Mitsuba). All nodes that read
-images are rows of one table, the :class:`Atlas`, which stages look up on lanes: N points at once, each with its own node.
+An image is stored in the atlas as ``(H, W, C)``, without a copy where all images lie in one block of memory. A node defines
+how it is read: channel, wrap mode, filter, transform of texture coordinates. Texel centres are at ``(i + 1/2) / size``; row 0
+is ``v = 0`` (Mitsuba). All nodes that read images are rows of one table, the :class:`Atlas`, which stages look up on lanes: N
+points at once, each with its own node. Nodes that read luminances, which are computed, have an atlas of their own.
 
 A filtered node has a mipmap (Williams, *Pyramidal Parametrics*, 1983). Each level is another node with the same settings, and
 a look-up interpolates between the two levels whose texels are about as large as the footprint.
@@ -13,11 +14,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from torchpt.core.memory_block import common_block
 from torchpt.core.threads import mean_all
 from torchpt.math.vectors import luminance, take
 from torchpt.physics.textures.base import IDENTITY, Matrix, Node, Table, TexturePoint, transform_uv
@@ -57,7 +60,7 @@ class ImageNode(Node):
     @property
     def variant(self) -> Hashable:
         """See :attr:`Node.variant`."""
-        return Atlas
+        return Atlas, self.channel == -1
 
     def divided(self, unit: float) -> ImageNode:
         """See :meth:`Node.divided`."""
@@ -101,12 +104,12 @@ class Mipmaps:
 
 @dataclass(frozen=True)
 class Atlas(Table):
-    """All planes of images, and the M nodes that read them, levels of mipmaps included.
+    """All images, and the M nodes that read them, levels of mipmaps included.
 
     Attributes:
-        texels: ``(T,)`` all planes.
-        layouts: ``(6, M)`` int64: first texel, stride between channels (0: one plane serves all), width, height, code of the
-            wrap mode, 1 if bilinear.
+        texels: ``(T,)`` numbers of all images.
+        layouts: ``(7, M)`` int64: first number, stride between texels, stride between channels (0: one serves all), width,
+            height, code of the wrap mode, 1 if bilinear.
         transforms: ``(9, M)``: rows of the transform of texture coordinates, then ``scale``.
         wraps: wrap modes in use; static.
         scaled: whether any node scales; static.
@@ -152,26 +155,20 @@ def atlas_of(nodes: Sequence[ImageNode], images: dict[str, Tensor], dtype: torch
         dtype: dtype of the world.
         device: device of the atlas.
     """
-    planes: list[Tensor] = []  # (1 or 3, H, W), one for each level
-    # Nodes that read the same channels of an image share its planes. By image and channel: for each level first texel, stride
-    # between channels, width, height.
-    levels_of: dict[tuple[str, int | None], list[list[int]]] = {}
-    layouts, transforms, coarser, end = [], [], [], 0  # coarser: layouts of the levels above 0 of each node
+    # Nodes that read the same channels of an image share its levels (H, W, 1 or 3).
+    levels_of: dict[tuple[str, int | None], list[Tensor]] = {}
     filtered = {(node.texels, node.channel) for node in nodes if node.filtered}
+    for source in dict.fromkeys((node.texels, node.channel) for node in nodes):
+        levels = levels_of[source] = [_channels(images[source[0]], source[1])]
+        while source in filtered and max(levels[-1].shape[:2]) > 1:
+            levels.append(_halved(_halved(levels[-1], dim=0), dim=1))
+    texels, places = _stored([level for levels in levels_of.values() for level in levels], dtype, device)
+    rest = iter(places)
+    layouts_of = {source: [next(rest) for _ in levels] for source, levels in levels_of.items()}
+    layouts, transforms, coarser = [], [], []  # coarser: layouts of the levels above 0 of each node
     for node in nodes:
-        source = (node.texels, node.channel)
-        if source not in levels_of:
-            levels = [_planes(images[node.texels], node.channel)]
-            while source in filtered and max(levels[-1].shape[1:]) > 1:
-                levels.append(_halved(_halved(levels[-1], dim=1), dim=2))
-            levels_of[source] = []
-            for level in levels:
-                channels, height, width = level.shape
-                levels_of[source].append([end, width * height if channels == 3 else 0, width, height])
-                planes.append(level)
-                end += level.numel()
         modes = [WRAPS.index(node.wrap), 0 if node.nearest else 1]
-        finest, *others = levels_of[source]
+        finest, *others = layouts_of[node.texels, node.channel]
         layouts.append([*finest, *modes])
         transforms.append([*node.transform[0], *node.transform[1], *node.scale])
         coarser.append([[*level, *modes] for level in others] if node.filtered else [])
@@ -182,7 +179,7 @@ def atlas_of(nodes: Sequence[ImageNode], images: dict[str, Tensor], dtype: torch
             first=(len(nodes) - 1 + torch.cumsum(counts, 0) - counts).to(device),
             top=counts.to(device=device, dtype=dtype),
             density=torch.tensor(
-                [_density(node, *layout[2:4]) for layout, node in zip(layouts, nodes, strict=True)],
+                [_density(node, *layout[3:5]) for layout, node in zip(layouts, nodes, strict=True)],
                 dtype=dtype,
                 device=device,
             ),
@@ -190,7 +187,7 @@ def atlas_of(nodes: Sequence[ImageNode], images: dict[str, Tensor], dtype: torch
         layouts += [layout for levels in coarser for layout in levels]
         transforms += [row for row, levels in zip(list(transforms), coarser, strict=True) for _ in levels]
     return Atlas(
-        texels=_joined(planes, dtype, device),
+        texels=texels,
         layouts=torch.tensor(layouts, dtype=torch.int64, device=device).T.contiguous(),
         transforms=torch.tensor(transforms, dtype=dtype, device=device).T.contiguous(),
         wraps=tuple(wrap for wrap in WRAPS if any(node.wrap == wrap for node in nodes)),
@@ -200,14 +197,31 @@ def atlas_of(nodes: Sequence[ImageNode], images: dict[str, Tensor], dtype: torch
     )
 
 
-def _joined(planes: Sequence[Tensor], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Return all numbers of planes, one after the other."""
-    if torch.is_grad_enabled() and any(plane.requires_grad for plane in planes):
-        return torch.cat([plane.reshape(-1).to(device=device, dtype=dtype) for plane in planes])
-    joined = torch.empty(sum(plane.numel() for plane in planes), dtype=dtype, device=device)
-    for part, plane in zip(joined.split([plane.numel() for plane in planes]), planes, strict=True):
-        part.view(plane.shape).copy_(plane)  # images are large: no copies on the way
-    return joined
+def _stored(levels: Sequence[Tensor], dtype: torch.dtype, device: torch.device) -> tuple[Tensor, list[list[int]]]:
+    """Return all numbers of levels ``(H, W, 1 or 3)``, and of each the first five rows of :attr:`Atlas.layouts`."""
+    block = common_block(levels)
+    even = all(level.stride(0) == level.shape[1] * level.stride(1) for level in levels)  # a row follows the one above
+    if block is not None and even and (block.dtype, block.device) == (dtype, device):
+        return block, [
+            _layout(level, int(level.storage_offset()), level.stride(1), level.stride(2)) for level in levels
+        ]
+    sizes = [level.numel() for level in levels]
+    layouts = [
+        _layout(level, end - level.numel(), level.shape[2], 1)
+        for level, end in zip(levels, accumulate(sizes), strict=True)
+    ]
+    if torch.is_grad_enabled() and any(level.requires_grad for level in levels):
+        return torch.cat([level.reshape(-1).to(device=device, dtype=dtype) for level in levels]), layouts
+    numbers = torch.empty(sum(sizes), dtype=dtype, device=device)
+    for copied, level in zip(numbers.split(sizes), levels, strict=True):
+        copied.view(level.shape).copy_(level)  # images are large: no copies on the way
+    return numbers, layouts
+
+
+def _layout(level: Tensor, first: int, texel_stride: int, channel_stride: int) -> list[int]:
+    """Return the first five rows of :attr:`Atlas.layouts` for a level ``(H, W, 1 or 3)``."""
+    height, width, channels = level.shape
+    return [first, texel_stride, channel_stride if channels == 3 else 0, width, height]
 
 
 def _density(node: ImageNode, width: int, height: int) -> float:
@@ -216,36 +230,34 @@ def _density(node: ImageNode, width: int, height: int) -> float:
     return abs(a * d - b * c) * width * height
 
 
-def _halved(planes: Tensor, dim: int) -> Tensor:
-    """Downsample planes ``(C, H, W)`` by 2 along ``dim`` (rounded down) with a box filter, exact for odd sizes too.
+def _halved(image: Tensor, dim: int) -> Tensor:
+    """Downsample an image ``(H, W, C)`` by 2 along ``dim`` (rounded down) with a box filter, exact for odd sizes too.
 
     For ``2 m + 1`` texels, output ``i`` covers ``i (2 + 1/m) .. (i + 1) (2 + 1/m)``: fractions of three texels.
     """
-    n = planes.shape[dim]
+    n = image.shape[dim]
     m = n // 2
     if m == 0:
-        return planes
+        return image
     # Texels 2 i, 2 i + 1 and, for odd sizes, 2 i + 2.
-    even = torch.arange(0, 2 * m, 2, device=planes.device)
-    left, right = (planes.narrow(dim, k, 2 * m - 1).index_select(dim, even) for k in range(2))
+    even = torch.arange(0, 2 * m, 2, device=image.device)
+    left, right = (image.narrow(dim, k, 2 * m - 1).index_select(dim, even) for k in range(2))
     if n % 2 == 0:
         return 0.5 * (left + right)
-    last = planes.narrow(dim, 2, 2 * m - 1).index_select(dim, even)
-    i = torch.arange(m, dtype=planes.dtype, device=planes.device)
-    i = i.view([m if k == dim else 1 for k in range(planes.dim())])
+    last = image.narrow(dim, 2, 2 * m - 1).index_select(dim, even)
+    i = torch.arange(m, dtype=image.dtype, device=image.device)
+    i = i.view([m if k == dim else 1 for k in range(image.dim())])
     return (left * (m - i) + right * m + last * (i + 1)) / n
 
 
-def _planes(image: Tensor, channel: int | None) -> Tensor:
-    """Return the planes ``(1 or 3, H, W)`` of an image that a node with this channel reads."""
+def _channels(image: Tensor, channel: int | None) -> Tensor:
+    """Return the channels ``(H, W, 1 or 3)`` of an image that a node with this channel reads."""
     coloured = image.shape[2] >= 3
     if channel is None:
-        return image[..., :3].permute(2, 0, 1) if coloured else image[..., :1].permute(2, 0, 1)
-    if channel >= 0:
-        return image[..., channel][None]
-    if not coloured:
-        return image[..., 0][None]
-    return luminance(image.movedim(-1, 0))[None]
+        return image[..., : 3 if coloured else 1]
+    if channel >= 0 or not coloured:
+        return image[..., max(channel, 0), None]
+    return luminance(image.movedim(-1, 0))[..., None]
 
 
 @dataclass(frozen=True)
@@ -329,7 +341,7 @@ def _levels(mipmaps: Mipmaps, node: Tensor, footprint: Tensor) -> tuple[Tensor, 
 def _corners(atlas: Atlas, node: Tensor, uv: Tensor, *, coloured: bool) -> _Corners:
     """Read the four texels around points ``uv (2, N)``, three channels of each if ``coloured``."""
     layout, transforms = take(atlas.layouts, node), take(atlas.transforms, node)
-    first, stride, width, height, wrap, linear = (layout[k] for k in range(6))
+    first, texel_stride, channel_stride, width, height, wrap, linear = (layout[k] for k in range(7))
     u, v = transform_uv(transforms, uv) if atlas.transformed else (uv[0], uv[1])
     blend = linear.to(uv.dtype)
     columns, rows = width.to(uv.dtype), height.to(uv.dtype)
@@ -339,13 +351,14 @@ def _corners(atlas: Atlas, node: Tensor, uv: Tensor, *, coloured: bool) -> _Corn
     i, j = x.detach().floor(), y.detach().floor()
     x, y = (x - i) * blend, (y - j) * blend
     i, j = i.to(torch.int64), j.to(torch.int64)
-    left, right = (_wrapped(atlas.wraps, k, width, wrap) for k in (i, i + 1))
-    top, bottom = (first + _wrapped(atlas.wraps, k, height, wrap) * width for k in (j, j + 1))
+    left, right = (_wrapped(atlas.wraps, k, width, wrap) * texel_stride for k in (i, i + 1))
+    row = width * texel_stride
+    top, bottom = (first + _wrapped(atlas.wraps, k, height, wrap) * row for k in (j, j + 1))
     if not coloured:
         a, b, c, d = (take(atlas.texels, row + column) for row in (top, bottom) for column in (left, right))
     else:
         # All channels of all lanes by one look-up, (3 N,).
-        steps = torch.arange(3, device=stride.device)[:, None] * stride
+        steps = torch.arange(3, device=node.device)[:, None] * channel_stride
         a, b, c, d = (
             take(atlas.texels, (steps + (row + column)).reshape(-1)).view(3, -1)
             for row in (top, bottom)

@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from torchpt.core.errors import SceneError
-from torchpt.core.tree import leaves
 from torchpt.physics.bsdfs import Bsdf, Parameters
 from torchpt.physics.bsdfs.records import LaneMaterials
 from torchpt.physics.bsdfs.resolved import ResolvedMaterial
@@ -41,7 +40,7 @@ from torchpt.scene.world.materials import (
     textures_of_group,
     vertex_attributes_of,
 )
-from torchpt.scene.world.pieces import ParameterReads, Pieced, piece
+from torchpt.scene.world.pieces import ParameterReads, Pieced, passing_piece, piece
 from torchpt.scene.world.primitives import Primitives, copies_of, copy_maps, corners_of_all, primitives_of
 
 __all__ = ["assemble"]
@@ -114,7 +113,7 @@ class _Assembly(Pieced):
 
     # -- surfaces
 
-    @piece
+    @passing_piece
     def corners(self) -> list[Corners]:
         """Return the corners of each part."""
         return corners_of_all(self.parts, self.parameters, self.space, self.dtype)
@@ -221,7 +220,7 @@ class _Assembly(Pieced):
         materials |= {name: self.lane_material(name) for name in materials if materials[name].opacity is not None}
         return opacity_of(self.owners, materials, self.slot_counts(), self.dtype, self.device)
 
-    @piece
+    @passing_piece
     def dark(self) -> Tensor:
         """Return ``(P + I,)`` 0 where a surface emits, else 1; instances cannot emit."""
         emits = [int(part.emission is None) for part in self.parts]
@@ -294,7 +293,7 @@ class _Assembly(Pieced):
         return lights_of(
             self.parts,
             self.sources,
-            _emitter_primitives(self.parts, self.corners(), self.primitives()),
+            _emitter_primitives(self.parts, self.primitives()),
             self.geometry(),
             self.parameters,
             self.space,
@@ -316,17 +315,14 @@ class _Assembly(Pieced):
         )
 
 
-def _emitter_primitives(parts: Sequence[Part], corners: Sequence[Corners], primitives: Primitives) -> Primitives:
+def _emitter_primitives(parts: Sequence[Part], primitives: Primitives) -> Primitives:
     """Return the primitives for the light table, detached where no emissive part requires gradients.
 
     Rows of the light table are slices of the tensors of all primitives. If any part requires gradients, so do those tensors,
     and the light table would be differentiated without need.
     """
-    moving = any(
-        part.emission is not None and any(tensor.requires_grad for tensor in leaves(own_corners))
-        for part, own_corners in zip(parts, corners, strict=True)
-    )
-    return primitives if moving else primitives.detached()
+    emissive = (taped for part, taped in zip(parts, primitives.taped, strict=True) if part.emission is not None)
+    return primitives if any(emissive) else primitives.detached()
 
 
 def _rows_and_keys(

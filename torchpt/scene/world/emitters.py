@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchpt.math.vectors import luminance
+from torchpt.math.vectors import cross, luminance
 from torchpt.physics.lights import COLUMNS, SURFACES, Faces, Setting, emitter, light_sampler
 from torchpt.physics.lights import KINDS as LIGHTS
 from torchpt.physics.lights.records import Lights
@@ -166,10 +166,10 @@ def _surfaces(
     dtype, device = primitives.p0.dtype, primitives.p0.device
     counts = torch.tensor([n for _, n in emitting], dtype=torch.int64, device=device)
     names = [part.kind for part, n in emitting for _ in range(n)]
-    p0, e1, e2, edge_cross, normal = (
-        x.index_select(1, prim)
-        for x in (primitives.p0, primitives.e1, primitives.e2, primitives.edge_cross, primitives.normal)
+    p0, e1, e2, normal = (
+        x.index_select(1, prim) for x in (primitives.p0, primitives.e1, primitives.e2, primitives.normal)
     )
+    edge_cross = cross(e1, e2)
     # areas: by which points are sampled; of a quadric the area in object space times |det|. world_areas: areas in the world, by
     # which power is estimated; both float64. columns: in the table of quadrics.
     areas, world_areas, columns, needs_quadrics, start = [], [], [], False, 0

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torchpt.core.errors import SceneError
+from torchpt.core.tree import leaves
 from torchpt.math.vectors import cross, dot, normalize
 from torchpt.physics.parts import Copy, Part
 from torchpt.physics.shapes.geometry import KINDS, Geometry, Instances, Quadrics
@@ -151,13 +152,13 @@ class Primitives:
 
     kinds: tuple[type[Primitive], ...]  # those that occur
     sizes: list[int]  # number of primitives of each part
+    taped: list[bool]  # whether each part requires gradients
     counts: tuple[int, int, int, int, int]
     p0: Tensor  # (3, P) first corner or centre
     p1: Tensor  # (3, P) as in Geometry
     p2: Tensor
     e1: Tensor  # (3, P) edges from p0; the first two axes of a sphere or quadric
     e2: Tensor
-    edge_cross: Tensor  # (3, P) cross product of the edges
     sign: Tensor  # (P,) -1 where a shape's normals are flipped
     normal: Tensor
     normals: tuple[Tensor, Tensor, Tensor] | None
@@ -167,10 +168,7 @@ class Primitives:
 
     def detached(self) -> Primitives:
         """Return detached primitives."""
-        tensors = {
-            name: getattr(self, name)
-            for name in ("p0", "p1", "p2", "e1", "e2", "edge_cross", "sign", "normal", "bound")
-        }
+        tensors = {name: getattr(self, name) for name in ("p0", "p1", "p2", "e1", "e2", "sign", "normal", "bound")}
         return replace(self, **{name: value.detach() for name, value in tensors.items()})
 
     def spread(self, values: Sequence[int]) -> Tensor:
@@ -218,8 +216,7 @@ def primitives_of(
     e2 = p2 - p0 if planar is None else torch.where(planar, p2 - p0, p2)
     signs = torch.tensor([-1.0 if part.flip else 1.0 for part in parts], dtype=dtype, device=device)
     sign = torch.repeat_interleave(signs, torch.tensor(sizes, dtype=torch.int64, device=device))
-    edge_cross = cross(e1, e2)
-    normal = normalize(edge_cross) * sign
+    normal = normalize(cross(e1, e2)) * sign
     normals = None
     if any(c.normals is not None for c in corners):
         faces = normal.split(sizes, 1)
@@ -256,13 +253,13 @@ def primitives_of(
     return Primitives(
         kinds=kinds,
         sizes=sizes,
+        taped=[any(tensor.requires_grad for tensor in leaves(of_part)) for of_part in corners],
         counts=counts,
         p0=p0,
         p1=p1,
         p2=p2,
         e1=e1,
         e2=e2,
-        edge_cross=edge_cross,
         sign=sign,
         normal=normal,
         normals=normals,

@@ -129,21 +129,24 @@ def build(
     top = halves[0].diff()  # near the south pole the other one keeps its digits
     heights = torch.where(halves[0, 1:] < 0.5, top, -halves[1].diff())
     with torch.no_grad():
-        light = luminance(planes).clamp_min(0.0).view(height, width)
+        light = _luminances(texels)
         zero = light.new_zeros(())
-        mean = sum_all(_weights(light, heights))
+        room = Distribution2D.room(
+            height - 1, width, light.device
+        )  # a map may be large: what is not kept is overwritten
+        mean = sum_all(_weights(light, heights, room))
         black = not bool(mean > 0)
         compensated = plain = None
         if not black and compensation is not False:
             floor = mean.to(light.dtype)
-            above = _weights((light - floor).clamp_min(0.0), heights)
+            above = _weights(light, heights, room, floor)
             if bool(sum_all(above) > 0) and (compensation or _uneven(above, mean, heights)):
-                compensated = _grid(above, floor)
-            del above  # a map may be large
+                compensated, room = _grid(above, floor), None
         if alone or compensated is None:
             # With a floor of -1 every texel of a black map has the value 1: a uniform density.
             values, floor = (torch.ones_like(light), zero - 1.0) if black else (light, zero)
-            plain = _grid(_weights(values, heights), floor)
+            room = Distribution2D.room(height - 1, width, light.device) if room is None else room
+            plain = _grid(_weights(values, heights, room), floor)
     return EnvironmentMap(
         texels=planes,
         height=height,
@@ -159,15 +162,30 @@ def build(
     )
 
 
-def _weights(values: Tensor, heights: Tensor) -> Tensor:
-    """Return integrals ``(H - 1, W)`` float64 over the cells of values ``(H, W)`` at the texels; the sphere has measure 1."""
-    found = torch.empty(len(values) - 1, values.shape[1], dtype=torch.float64, device=values.device)
-    for first in range(0, len(found), _ROWS):  # a map may be large, and so would be what is between
-        block = found[first : first + _ROWS]
-        v = values[first : first + len(block) + 1].double()
+def _luminances(texels: Tensor) -> Tensor:
+    """Return the luminances ``(H, W)`` of texels ``(H, W, 3)``, at least 0."""
+    found = texels.new_empty(texels.shape[:2])
+    for rows, light in zip(texels.split(_ROWS), found.split(_ROWS), strict=True):  # a map may be large
+        torch.clamp_min(luminance(rows.movedim(-1, 0)), 0.0, out=light)
+    return found
+
+
+def _weights(values: Tensor, heights: Tensor, out: Tensor, floor: Tensor | None = None) -> Tensor:
+    """Return integrals over the cells of values ``(H, W)`` at the texels, in ``out``; the sphere has measure 1.
+
+    Args:
+        values: the values.
+        heights: differences of ``(1 - cos(theta)) / 2`` between the rows ``(H - 1,)``.
+        out: ``(H - 1, W)`` float64.
+        floor: ``()`` what counts is the excess over it; None: the values.
+    """
+    for first in range(0, len(out), _ROWS):  # a map may be large, and so would be what is between
+        block = out[first : first + _ROWS]
+        v = values[first : first + len(block) + 1]
+        v = (v if floor is None else (v - floor).clamp_min(0.0)).double()
         v = v.roll(-1, 1).add_(v)
         torch.add(v[:-1], v[1:], out=block)
-    return found.mul_(0.25).mul_((heights / values.shape[1])[:, None])
+    return out.mul_(0.25).mul_((heights / values.shape[1])[:, None])
 
 
 def _uneven(weights: Tensor, mean: Tensor, heights: Tensor) -> bool:
@@ -179,9 +197,9 @@ def _uneven(weights: Tensor, mean: Tensor, heights: Tensor) -> bool:
 
 
 def _grid(weights: Tensor, floor: Tensor) -> Grid:
-    """Return the density of integrals over the cells, in which the sphere has measure 1."""
+    """Return the density of integrals over the cells, in which the sphere has measure 1; they are overwritten."""
     factor = (1.0 / (4.0 * math.pi * sum_all(weights))).to(floor.dtype)
-    return Grid(cells=Distribution2D.of(weights), floor=floor, factor=factor)
+    return Grid(cells=Distribution2D.within(weights), floor=floor, factor=factor)
 
 
 def _cell_of(map: EnvironmentMap, d: Tensor) -> Cell:
