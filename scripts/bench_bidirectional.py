@@ -130,7 +130,7 @@ def trimmed_mean(pixels: Tensor) -> Tensor:
 
 def own(scene: Scene, film: dict[str, Any], keys: dict[str, Any], arguments: argparse.Namespace) -> Shoot:
     """Return what renders by an integrator of torchpt."""
-    integrator = {**keys, "max_depth": arguments.depth, "rr_depth": 5}
+    integrator = {**keys, "max_depth": arguments.depth, "rr_depth": 5, "dark_rims": True}
 
     def shoot(spp: int, seed: int) -> Tensor:
         return torchpt.render(

@@ -97,7 +97,7 @@ def compare(mitsuba: Any, scene: Scene, size: int, spp: int, seeds: int, depth: 
     def wishes(seed: int) -> Any:
         blocks = {
             "film": {"width": size, "height": size, "filter": "box"},
-            "integrator": {"type": "path", "max_depth": depth, "rr_depth": 5},
+            "integrator": {"type": "path", "max_depth": depth, "rr_depth": 5, "dark_rims": True},
             "render": {"spp": spp, "seed": seed, "compile": "off"},
         }
         return settings(scene.description, blocks)

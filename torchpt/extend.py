@@ -25,7 +25,7 @@ from torchpt.math.sampling import (
     uniform_sphere,
 )
 from torchpt.math.vectors import Frame, dot, luminance, normalize
-from torchpt.paths.integrators.base import LIGHT_CHOICE, SAMPLES, STRATEGY, Limits
+from torchpt.paths.integrators.base import DARK_RIMS, LIGHT_CHOICE, SAMPLES, STRATEGY, Limits
 from torchpt.paths.integrators.first_surface import FirstSurface, FirstSurfaceIntegrator
 from torchpt.paths.integrators.kinds.path import Path
 from torchpt.paths.layers import FilmLayer, Seen, SurfaceLayer
@@ -65,6 +65,7 @@ from torchpt.spec import Angle, Choice, Color, Custom, Flag, Integer, Moves, Ref
 
 __all__ = [
     "BOTTOM",
+    "DARK_RIMS",
     "GREY",
     "LIGHT_CHOICE",
     "SAMPLES",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
@@ -18,12 +19,17 @@ LIGHTS = {
 MATERIALS: dict[str, dict[str, Any]] = {
     "diffuse": {"type": "diffuse", "reflectance": 0.8},
     "conductor": {"type": "roughconductor", "roughness": 0.7},
+    "mapped": {"type": "diffuse", "reflectance": 0.8, "normal_map": {"type": "checkerboard"}},
 }
+#: Of a normal map: all normals lean by 0.2 along u.
+TILT = [0.5 + 0.5 * math.sin(0.2), 0.5, 0.5 + 0.5 * math.cos(0.2)]
+MATERIALS["mapped"]["normal_map"] |= {"color0": TILT, "color1": TILT}
 FLOOR = {"type": "rectangle", "material": "it", "transform": [{"scale": 4}, {"translate": [0, 0, -1.1]}]}
 #: By material and depth: derivatives as the ball grows, and as it grows taller, by central differences.
 KNOWN = {
     ("diffuse", 2): ((536.2, 0.3), (210.8, 0.2)),
     ("diffuse", 3): ((431.6, 1.2), (190.5, 0.8)),
+    ("mapped", 2): ((522.8, 0.1), (208.2, 0.1)),
     ("conductor", 2): ((270.1, 0.4), (97.4, 0.2)),
     ("conductor", 3): ((291.3, 1.0), (124.5, 1.0)),
 }
@@ -33,6 +39,7 @@ KNOWN = {
 def test_outlines_have_gradients(name: str, depth: int) -> None:
     shapes = {"floor": FLOOR} if depth > 2 else {}
     described = ball_under(LIGHTS, MATERIALS[name], shapes=shapes, integrator={"type": "path", "max_depth": depth})
+    described["shapes"]["ball"]["uvs"] = [[0.5 + 0.5 * x, 0.5 + 0.5 * z] for x, _, z in CORNERS]
     scene, corners = torchpt.load(described, "cpu"), torch.tensor(CORNERS)
     y, x = torch.meshgrid(torch.linspace(0, 1, 24), torch.linspace(0, 1, 24), indexing="ij")
     weight = (1.0 + torch.sin(5.0 * x + 1.0) * torch.cos(4.0 * y))[..., None]

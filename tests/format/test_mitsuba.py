@@ -233,7 +233,7 @@ def test_files_before_version_2_mean_what_they_meant_then(assets: Path) -> None:
     assert read(assets, scene(light))["lights"]["constant_1"]["radiance"] == pytest.approx([2.41, 1.90, 1.82], abs=0.01)
     without = re.sub("<integrator.*</integrator>", "", scene(""), flags=re.DOTALL)
     assert read(assets, without.replace("3.0.0", "0.6.0"))["integrator"]["type"] == "direct"
-    assert read(assets, without)["integrator"]["type"] == "path"
+    assert read(assets, without)["integrator"] == {"type": "path", "max_depth": -1, "dark_rims": True}
     checker = (
         '<bsdf type="diffuse"><texture type="checkerboard" name="reflectance"><float name="uscale" value="4"/>'
         '<float name="uoffset" value="0.25"/></texture></bsdf>'

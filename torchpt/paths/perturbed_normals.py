@@ -49,15 +49,17 @@ def perturb_normal(
     d: Tensor,
     at: Interaction,
     side: Tensor | None,
+    mirrored: bool = False,
 ) -> tuple[Frame, PerturbedNormal]:
     """Return the shading frame about the normal of a normal or bump map, and the unperturbed normal.
 
     The vectors of a normal map are relative to the tangent along texture coordinate u, the cross product of the shading normal
     with this tangent, and the shading normal.
     The heights of a bump map displace the surface along its normal (Blinn, *Simulation of Wrinkled Surfaces*, 1978). The back
-    of a surface shows the mirror image. A perturbed normal that faces away from the viewer is mirrored about the unperturbed
-    one (after Schuessler, Heitz, Hanika, Dachsbacher, *Microfacet-based Normal Mapping*, 2017). All as Mitsuba's ``normalmap``
-    and ``bumpmap``.
+    of a surface shows the mirror image. Where light passes, and if ``mirrored``, a perturbed normal that faces away from the
+    viewer is mirrored about the unperturbed one (after Schuessler, Heitz, Hanika, Dachsbacher, *Microfacet-based Normal
+    Mapping*, 2017). So are Mitsuba's ``normalmap`` and ``bumpmap``. The picture jumps where mirroring begins, at no edge of
+    the geometry, and gradients miss that.
 
     Args:
         textures: textures of the model.
@@ -67,6 +69,7 @@ def perturb_normal(
         d: ``(3, N)`` directions of the incoming rays.
         at: the surface points.
         side: ``(N,)`` -1 where the shading normal is flipped, on the back, else 1; None where the model transmits.
+        mirrored: whether perturbed normals that face away are mirrored where the model transmits nothing.
     """
     assert at.tangent is not None
     base = Frame.along(at.ns, at.tangent)  # s along the tangent, t across, n the shading normal
@@ -88,9 +91,9 @@ def perturb_normal(
         x, y, z = x * sign, y * sign, z * sign
     n = at.ns if side is None else at.ns * side
     normal = normalize(affine(base.s * x, base.t, y, n, z))  # x s + y t + z n
-    # A transmitting surface may be seen from either side: there the ray meets the two normals from different ones.
-    away = (dot(d, normal) * (dot(d, n) if side is None else -1.0) <= 0).detach()
-    normal = torch.where(away, normalize(affine(base.s * -x, base.t, -y, n, z)), normal)
+    if side is None or mirrored:
+        away = (dot(d, n) * dot(d, normal) <= 0).detach()  # the ray meets the two normals from different sides
+        normal = torch.where(away, normalize(affine(base.s * -x, base.t, -y, n, z)), normal)
     flat = dot(normal, normal) == 0  # no texture coordinates, so no slope
     normal = torch.where(flat, n, normal)
     square = dot(normal, n).square().clamp_min(_LEAST_SQUARE)

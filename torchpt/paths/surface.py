@@ -25,7 +25,6 @@ __all__ = [
     "Surface",
     "TexturePoint",
     "emission_map",
-    "facing_normal",
     "opacity_map",
     "parameters_at",
     "shading_normal",
@@ -82,7 +81,10 @@ class Surface:
     """Surface points with their material resolved, of one BSDF model."""
 
     frame: Frame  # about the shading normal, flipped on the back unless the model transmits
-    side: Tensor | None  # (N,) -1 on the back, by `facing_normal`, else 1; None where the model transmits
+    side: Tensor | None  # (N,) -1 on the back, else 1; None where the model transmits
+    outward: (
+        Tensor | None
+    )  # (3, N) normal on the side that is seen, which tells the side; None where the model transmits
     front_mask: Tensor | None  # (N,) 0 on the back of one-sided surfaces; None where there are none
     parameters: bsdfs.Parameters  # parameters of the BSDF at each lane, textures included
     wo: Tensor  # (3, N) direction to the previous vertex, see `local_wo`
@@ -99,8 +101,9 @@ class Surface:
 
 def _upper(frame: Frame, w: Tensor, side: Tensor | None) -> Tensor:
     """Return :meth:`Surface.local_wo`."""
-    wo = frame.to_local(w)
-    return wo if side is None else torch.stack((wo[0], wo[1], wo[2].abs()))
+    if side is None:
+        return frame.to_local(w)
+    return torch.stack((dot(frame.s, w), dot(frame.t, w), dot(frame.n, w).abs()))
 
 
 def surface_at(
@@ -120,39 +123,35 @@ def surface_at(
         d: directions ``(3, N)`` of the incoming rays.
         at: the surface points.
         pixel: ``(5,)`` footprint of a pixel, as for :func:`texture_point_at`; None: textures are not filtered.
-        dark_rims: as for :func:`facing_normal`.
+        dark_rims: True: shading normals tell from which side an opaque surface is seen, as in Mitsuba: near outlines some face
+            away, and show the dark inside of a body; mapped normals that face away are mirrored. False: geometric normals do.
     """
     model, row = world.materials.models[number], take(world.materials.row, at.slot)
     textures = world.materials.textures[number]
     point = texture_point_at(world, number, at, pixel)
-    ns, side, front_mask, perturbed_normal = at.ns, None, None, None
+    ns, side, outward, front_mask, perturbed_normal = at.ns, None, None, None, None
     if not model.transmits:
-        side = _side(d, facing_normal(at, dark_rims=dark_rims))
+        outward = at.ns if dark_rims else at.ng
+        side = _side(d, outward)
+        outward = outward * side
         two_sided = world.materials.two_sided[number]
         if two_sided is not None:
             front_mask = ((side > 0) | take(two_sided, row)).to(side.dtype)
     if textures is not None and (textures.normal is not None or textures.bump is not None):
         assert point is not None
-        frame, perturbed_normal = _perturbed_frame(world, textures, row, point, d, at, side)
+        frame, perturbed_normal = _perturbed_frame(world, textures, row, point, d, at, side, dark_rims)
     else:
         ns = ns if side is None else ns * side
         frame = Frame.along(ns, at.tangent) if model.anisotropic and at.tangent is not None else Frame.about(ns)
     return Surface(
         frame=frame,
         side=side,
+        outward=outward,
         front_mask=front_mask,
         parameters=parameters_at(world, number, row, at, point),
         wo=_upper(frame, -d, side),
         perturbed_normal=perturbed_normal,
     )
-
-
-def facing_normal(at: Interaction, *, dark_rims: bool) -> Tensor:
-    """Return the normals ``(3, N)`` by which it is told from which side a surface that transmits nothing is seen.
-
-    ``dark_rims``: the shading normals, as in Mitsuba: near outlines some face away, and show the dark inside of a body.
-    """
-    return at.ns if dark_rims else at.ng
 
 
 def _side(d: Tensor, n: Tensor) -> Tensor:
@@ -255,9 +254,9 @@ def shading_normal(world: World, number: int, d: Tensor, at: Interaction, point:
         return at.ns
     assert point is not None
     row = take(world.materials.row, at.slot)
-    side = _side(d, at.ng)
+    side = None if world.materials.models[number].transmits else _side(d, at.ng)
     frame, _ = _perturbed_frame(world, textures, row, point, d, at, side)
-    return frame.n * side
+    return frame.n if side is None else frame.n * side
 
 
 def _perturbed_frame(
@@ -268,6 +267,7 @@ def _perturbed_frame(
     d: Tensor,
     at: Interaction,
     side: Tensor | None,
+    mirrored: bool = False,
 ) -> tuple[Frame, PerturbedNormal]:
     """Return the shading frame of a normal or bump map, and the unperturbed normal; arguments as for :func:`perturb_normal`."""
     colour = None if textures.normal is None else _texture_values(world, textures.normal, row, point)
@@ -277,4 +277,4 @@ def _perturbed_frame(
         table = world.textures.tables[textures.bump.table]
         point = point if textures.bump.filtered else point.unfiltered
         slope = table.slope(take(textures.bump.nodes, row), point)
-    return perturb_normal(textures, row, colour, slope, d, at, side)
+    return perturb_normal(textures, row, colour, slope, d, at, side, mirrored)

@@ -45,7 +45,7 @@ def _found(scene: Scene, settings: Settings, params: Mapping[str, Tensor]) -> It
         yield "those where texture coordinates of round surfaces begin anew"
     if any(part.quadric is not None and not known(part.quadric.form) for part in built.parts):
         yield "outlines of quadrics of kinds of your own"
-    if settings.integrator.dark_rims and any(part.smooth for part in built.parts):
+    if settings.integrator.dark_rims and any(part.smooth and not part.material.model.transmits for part in built.parts):
         yield "inner borders of the dark rims of smooth shading (integrator.dark_rims=false has none)"
     if any(source.kind == "spot" and _sharp(params, source.name) for source in built.sources):
         yield "the rims of spots that do not fade out"

@@ -19,7 +19,7 @@ from torchpt.gradients.edges.traced import Passing, Traced
 from torchpt.math.sampling import uniform_hemisphere
 from torchpt.math.vectors import Frame, cross, dot, rows, take
 from torchpt.paths.integrators.path import partition
-from torchpt.paths.state import Drawn
+from torchpt.paths.state import Drawn, Plan
 from torchpt.paths.surface import Surface, surface_at
 from torchpt.paths.vertex import has_shading_normals, sample_bsdf, shading_weight
 from torchpt.physics.bsdfs import Bsdf
@@ -138,7 +138,7 @@ class Spot:
             draws = self.traced.draws(take(key, index), depth)
             drawn = sample_bsdf(context, model, at, surface, draws)
             if has_shading_normals(world, model) and not kind.transmits:
-                drawn = _over_plane(kind, n, surface, drawn, draws)
+                drawn = _with_even_directions(context.plan, kind, n, surface, drawn, draws)
             usable = (drawn.pdf > 0) & torch.isfinite(drawn.pdf)
             factor = dot(drawn.d, at.ng).abs() / torch.where(usable, drawn.pdf, 1.0)
             value = self._weighed(model, at, drawn.d, back, own) * factor
@@ -148,7 +148,7 @@ class Spot:
         return o, d, weight
 
 
-def _over_plane(kind: Bsdf, n: Tensor, surface: Surface, drawn: Drawn, draws: Draws) -> Drawn:
+def _with_even_directions(plan: Plan, kind: Bsdf, n: Tensor, surface: Surface, drawn: Drawn, draws: Draws) -> Drawn:
     """Return BSDF samples of which some are replaced by directions that are even over the plane of normals ``n (3, N)``.
 
     Surfaces are seen from below their shading normal too, along directions that the BSDF never samples.
@@ -156,9 +156,14 @@ def _over_plane(kind: Bsdf, n: Tensor, surface: Surface, drawn: Drawn, draws: Dr
     other = draws.one(Dimension.LIGHT_DIGITS) < _EVEN
     even = Frame.about(n).to_world(uniform_hemisphere(draws.two(Dimension.LIGHT).to(n.dtype)))
     d = torch.where(other, even, drawn.d)
-    pdf = torch.where(other, kind.pdf(surface.parameters, surface.wo, surface.frame.to_local(d)), drawn.pdf)
-    over = (dot(d, n) > 0).to(pdf.dtype)
-    return replace(drawn, d=d, pdf=(1.0 - _EVEN) * pdf + (_EVEN * 0.5 / math.pi) * over)
+    local = surface.frame.to_local(d)
+    if plan.strategy == "uniform" and not kind.delta:  # as BSDF samples are drawn
+        pdf = (0.5 / math.pi) * (local[2] > 0)
+    else:
+        pdf = torch.where(other, kind.pdf(surface.parameters, surface.wo, local), drawn.pdf)
+    mixed = (1.0 - _EVEN) * pdf + (_EVEN * 0.5 / math.pi) * (dot(d, n) > 0)
+    # A failed sample of the BSDF has a direction, but no density.
+    return replace(drawn, d=d, pdf=torch.where(other | (drawn.pdf > 0), mixed, 0.0))
 
 
 def met(traced: Traced, o: Tensor, d: Tensor, passing: Passing | None = None) -> Spot:

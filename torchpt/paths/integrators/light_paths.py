@@ -34,7 +34,6 @@ from torchpt.paths.state import (
     Field,
     PathState,
     Photon,
-    Plan,
     Shadow,
     Splat,
     StageContext,
@@ -43,7 +42,7 @@ from torchpt.paths.state import (
     VertexOutput,
 )
 from torchpt.paths.store import BLOCKS
-from torchpt.paths.surface import Surface, facing_normal, surface_at
+from torchpt.paths.surface import Surface, surface_at
 from torchpt.paths.wave import camera_state
 from torchpt.physics import lights
 from torchpt.physics.lights.emission import LightRay, emit, light_weight
@@ -68,12 +67,6 @@ class _View:
     throughput: Tensor  # (3, N), with the factors of shading normals and one-sided surfaces
     arrival: Arrival  # the numbers of MIS
     ray: LightRay | None  # with which the path left its light; None behind the first vertex
-
-
-def _same_side(plan: Plan, d: Tensor, at: Interaction, w: Tensor) -> Tensor:
-    """Return values ``(N,)`` that are positive where light along ``d (3, N)`` meets the side that is seen from ``w (3, N)``."""
-    n = facing_normal(at, dark_rims=plan.dark_rims)
-    return -(dot(d, n) * dot(w, n))
 
 
 class LightPaths(Integrator):
@@ -211,8 +204,8 @@ class LightPaths(Integrator):
         value, reverse = kind.eval_pdf(view.surface.parameters, wo, view.wi)
         cosine = dot(w, at.ng).abs()
         value = view.throughput * value * (cosine * state.extra["flux"] / view.arrival.cosine)
-        if not kind.transmits:
-            value = torch.where(_same_side(context.plan, state.d, at, w) > 0, value, 0.0)
+        if view.surface.outward is not None:
+            value = torch.where(dot(w, view.surface.outward) > 0, value, 0.0)
         return End(
             p=at.p,
             o=offset_origin(world, at, w),
@@ -286,8 +279,8 @@ class LightPaths(Integrator):
         (column, weight_x), (row, weight_y) = filter.splat(x, u[0].to(plan.dtype)), filter.splat(y, u[1].to(plan.dtype))
         column, row = column - crop[0], row - crop[1]
         seen = ahead & (column >= 0) & (column < crop[2]) & (row >= 0) & (row < crop[3])
-        if not kind.transmits:
-            seen = seen & (_same_side(context.plan, state.d, at, w) > 0)
+        if view.surface.outward is not None:
+            seen = seen & (dot(w, view.surface.outward) > 0)
         area = density * dot(w, at.ng).abs()  # square pixels for each area of the surface
         scale = area * state.extra["flux"] / arrival.cosine
         if self.weighted:
@@ -325,8 +318,8 @@ class LightPaths(Integrator):
         if kind.delta and surface.perturbed_normal is not None:  # light along `d` would meet another normal
             same = dot(view.surface.frame.n, surface.frame.n) > 1.0 - 1e-4
             least = torch.where(torch.isinf(pdf) & ~same, 0.0, least)
-        if not kind.transmits and stages.has_shading_normals(context.world, model):
-            least = torch.minimum(least, _same_side(plan, state.d, at, d))
+        if view.surface.outward is not None and stages.has_shading_normals(context.world, model):
+            least = torch.minimum(least, dot(d, view.surface.outward))
         drawn = Drawn(
             o=offset_origin(context.world, at, d),
             d=d,

@@ -85,11 +85,12 @@ def reduced(weight: Tensor | None, other: Tensor) -> Tensor:
 
 
 def seen_from(context: StageContext, model: int, at: Interaction, surface: Surface, w: Tensor) -> Surface:
-    """Return surface points as they are seen from unit directions ``w (3, N)``.
+    """Return surface points as they are seen from unit directions ``w (3, N)`` on the same side.
 
-    Only perturbed normals differ, which are mirrored where they face away from the viewer.
+    Only perturbed normals may differ, which may be mirrored where they face away from the viewer.
     """
-    if surface.perturbed_normal is None:
+    opaque = surface.outward is not None
+    if surface.perturbed_normal is None or (opaque and not context.plan.dark_rims):
         return surface
     return surface_at(context.world, model, -w, at, context.pixel, dark_rims=context.plan.dark_rims)
 

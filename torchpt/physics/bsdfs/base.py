@@ -51,7 +51,7 @@ class Bsdf:
         delta: whether ``sample`` may give ``pdf = inf``.
         smooth: whether all lobes are deltas: then no light is sampled.
         transmits: whether light passes through. Other models get ``wo.z >= 0`` only: callers flip the frame on the back, or
-            make the back black (``two_sided``).
+            make the back black (``two_sided``), and mirror a ``wo`` below the normal.
         refracts: whether ``sample`` returns ``eta``.
         anisotropic: whether the tangent matters.
         conserves: whether it reflects no more than it receives, for all parameters in their ranges. Tests read this attribute
