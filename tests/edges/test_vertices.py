@@ -16,7 +16,7 @@ from torchpt.math.vectors import Frame, dot
 from torchpt.paths.state import Drawn, Plan
 from torchpt.paths.surface import Surface
 from torchpt.physics.bsdfs import gather
-from torchpt.physics.samplers import Draws
+from torchpt.physics.samplers import Dimension, Draws
 
 COUNT = 1 << 17
 
@@ -71,7 +71,7 @@ def test_directions_have_the_density_they_are_drawn_with(material: dict[str, Any
         wo=wi,
         perturbed_normal=None,
     )
-    sample = kind.sample(parameters, wi, draws.one(None), draws.two(None))
+    sample = kind.sample(parameters, wi, draws.one(Dimension.LOBE), draws.two(Dimension.BSDF))
     drawn = Drawn(
         o=n, d=sample.wi, wi=sample.wi, pdf=sample.pdf, weight=sample.weight, least=n[0], sharp=None, eta=None
     )
@@ -91,7 +91,7 @@ def test_directions_have_the_density_they_are_drawn_with(material: dict[str, Any
 
     usable = (found.pdf > 0) & torch.isfinite(found.pdf)
     ours = torch.where(usable, flux(found.d) / torch.where(usable, found.pdf, 1.0), 0.0)
-    even = Frame.about(n).to_world(uniform_hemisphere(draws.two(None)))
+    even = Frame.about(n).to_world(uniform_hemisphere(draws.two(Dimension.BSDF)))
     theirs = flux(even) * (2.0 * math.pi)
     for a, b in (
         (ours * (found.d[2] < 0), theirs * (even[2] < 0)),

@@ -334,7 +334,7 @@ def test_every_lane_rounds_alike():
 
 def test_cells_and_their_ends():
     weights = torch.tensor([[0.0, 0, 0], [0, 2, 0], [0, 0, 0], [1, 0, 1], [0, 0, 0]])
-    cells = Distribution2D.within(Distribution2D.room(*weights.shape, weights.device).copy_(weights))
+    cells = Distribution2D.within(Distribution2D.room(5, 3, weights.device).copy_(weights))
     u = torch.tensor(
         [[0.0, 0.0], [1 - 2.0**-24, 0.0], [0.0, 1 - 2.0**-24], [1 - 2.0**-24, 1 - 2.0**-24]]
     ).T.contiguous()

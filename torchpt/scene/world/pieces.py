@@ -130,15 +130,15 @@ class ParameterReads(Mapping[str, Tensor]):
         finally:
             self._reads.pop()
 
-    def piece(self, key: Hashable, make: Callable[[], Any], lasting: bool = True) -> Any:
+    def piece(self, key: Hashable, make: Callable[[], Any], keep: bool = True) -> Any:
         """Return the piece of a key: the kept one where the parameters that it was made from are unchanged, else a new one.
 
         Args:
             key: of the piece.
             make: makes it.
-            lasting: False: it is dropped with this assembly.
+            keep: False: it is dropped with this assembly.
         """
-        value, reads = self._found(key) or self._new(key, make, lasting)
+        value, reads = self._found(key) or self._new(key, make, keep)
         if self._reads:
             self._reads[-1].update(reads)
         return value
@@ -154,8 +154,8 @@ class ParameterReads(Mapping[str, Tensor]):
         self._made[key] = kept.value, kept.states.keys()
         return self._made[key]
 
-    def _new(self, key: Hashable, make: Callable[[], Any], lasting: bool) -> tuple[Any, Collection[str]]:
-        """Make the piece of a key, and keep it if it is ``lasting``."""
+    def _new(self, key: Hashable, make: Callable[[], Any], keep: bool) -> tuple[Any, Collection[str]]:
+        """Make the piece of a key, and keep it if so wished."""
         if self._kept is not None:
             self._kept.drop((key, self._variant))
         reads: set[str] = set()
@@ -165,7 +165,7 @@ class ParameterReads(Mapping[str, Tensor]):
         finally:
             self._reads.pop()
         self._made[key] = value, reads
-        states = self._states_of(reads) if lasting and self._kept is not None else None
+        states = self._states_of(reads) if keep and self._kept is not None else None
         if self._kept is not None and states is not None:
             self._kept.keep((key, self._variant), value, states)
         return value, reads
@@ -248,19 +248,19 @@ def piece(method: Callable[Concatenate[M, P], R]) -> Callable[Concatenate[M, P],
     The result may depend on ``self.parameters``, on other pieces, and on what is the same in all assemblies of a scene and
     variant.
     """
-    return _pieced(method, lasting=True)
+    return _pieced(method, keep=True)
 
 
 def passing_piece(method: Callable[Concatenate[M, P], R]) -> Callable[Concatenate[M, P], R]:
     """Keep the result of a method as :func:`piece` does, but within one assembly: it is large, and only pieces read it."""
-    return _pieced(method, lasting=False)
+    return _pieced(method, keep=False)
 
 
-def _pieced(method: Callable[Concatenate[M, P], R], lasting: bool) -> Callable[Concatenate[M, P], R]:
+def _pieced(method: Callable[Concatenate[M, P], R], keep: bool) -> Callable[Concatenate[M, P], R]:
     name = method.__name__
 
     @wraps(method)
     def kept(self: M, *args: P.args, **kwargs: P.kwargs) -> R:
-        return self.parameters.piece((name, *args), lambda: method(self, *args, **kwargs), lasting)
+        return self.parameters.piece((name, *args), lambda: method(self, *args, **kwargs), keep)
 
     return kept
