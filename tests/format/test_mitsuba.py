@@ -349,6 +349,19 @@ def test_a_missing_file_is_an_error_or_grey(assets: Path) -> None:
     assert found["shapes"]["rectangle_1"]["material"]["reflectance"] == [0.5] * 3
 
 
+def test_a_missing_include_is_an_error_or_left_out(assets: Path) -> None:
+    text = scene('<include filename="none.xml"/><shape type="sphere"><ref id="red"/></shape><ref id="lamp"/>')
+    assert error(assets, text).endswith("that is there (import.missing=warn goes on without it), got 'none.xml'")
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        found = read_mitsuba(assets / "scene.xml", "scene.xml", ImportOptions(missing=True))
+    assert len(said) == 3 and any("none.xml is not there, and left out" in str(warning.message) for warning in said)
+    assert list(found["shapes"]) == ["sphere_1"]
+    assert "expected the id of an element" in error(
+        assets, text.replace('<include filename="none.xml"/>', ""), missing=True
+    )
+
+
 def test_a_mesh_without_area_is_left_out(tmp_path: Path) -> None:
     (tmp_path / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n")
     (tmp_path / "empty.obj").write_text("v 0 0 0\n")

@@ -72,21 +72,25 @@ class Element:
         return SceneError(f"line {self.line}", value, expected, self.file)
 
 
-def parse_scene(path: Path, file: str, given: Mapping[str, str]) -> Element:
+def parse_scene(
+    path: Path, file: str, given: Mapping[str, str], *, missing: bool = False
+) -> tuple[Element, list[Element]]:
     """Parse a scene file.
 
     Args:
         path: the file.
         file: the same as errors show it.
         given: values of the scene's parameters, in place of its ``<default>``.
+        missing: whether included files may be missing.
 
     Returns:
-        The element ``<scene>``, with the children of included files in the place of each ``<include>``.
+        The element ``<scene>``, with the children of included files in the place of each ``<include>``; and each
+        ``<include>`` whose file is missing.
 
     Raises:
-        SceneError: no well-formed XML, no scene, a parameter without a value, limits exceeded.
+        SceneError: no well-formed XML, no scene, a parameter without a value, limits exceeded, a missing file.
     """
-    reader = _Reader(dict(given))
+    reader = _Reader(dict(given), missing)
     root = reader.read(path, file, trail=())
     unknown = [name for name in given if name not in reader.used | reader.declared]
     if unknown:
@@ -96,14 +100,15 @@ def parse_scene(path: Path, file: str, given: Mapping[str, str]) -> Element:
         raise SceneError(
             f"scene_params.{unknown[0]}", given[unknown[0]], f"a parameter of the scene: {names}{hint}", file
         )
-    return root
+    return root, reader.left_out
 
 
 class _Reader:
     """Reader of the files of one scene; ``parameters`` are the values by name, ``used`` those that stand somewhere."""
 
-    def __init__(self, parameters: dict[str, str]) -> None:
-        self.parameters = parameters
+    def __init__(self, parameters: dict[str, str], missing: bool) -> None:
+        self.parameters, self.missing = parameters, missing
+        self.left_out: list[Element] = []
         self.used: set[str] = set()
         self.declared: set[str] = set()
         self.files = self.elements = self.substituted = 0
@@ -192,7 +197,10 @@ class _Reader:
                     if path.resolve() in trail:
                         raise element.error(name, "a file that does not include itself")
                     return self.read(path, _shown(path), trail).children
-        raise element.error(name, "the name of a file that is there")
+        if not self.missing:
+            raise element.error(name, "the name of a file that is there (import.missing=warn goes on without it)")
+        self.left_out.append(element)
+        return []
 
     def _substitute(self, element: Element) -> None:
         """Put the values of parameters in place of ``$name`` in the attributes of an element."""

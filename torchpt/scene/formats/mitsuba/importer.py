@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -139,8 +139,8 @@ def read_mitsuba(path: Path, file: str, options: ImportOptions) -> dict[str, Any
     Warns:
         ImportedSceneWarning: what has no exact twin, one warning for each kind.
     """
-    root = parse_scene(path, file, options.parameters)
-    importer = Importer(root, path.resolve().parent, options)
+    root, left_out = parse_scene(path, file, options.parameters, missing=options.missing)
+    importer = Importer(root, path.resolve().parent, options, left_out)
     scene = importer.scene()
     importer.notes.warn()
     return scene
@@ -157,7 +157,7 @@ class Importer:
         lights: lights by name.
     """
 
-    def __init__(self, root: Element, base: Path, options: ImportOptions) -> None:
+    def __init__(self, root: Element, base: Path, options: ImportOptions, left_out: Sequence[Element]) -> None:
         self.root, self.base, self.options = root, base, options
         self.notes = Notes(strict=options.strict)
         self.materials: dict[str, Any] = {}
@@ -169,6 +169,20 @@ class Importer:
         self._folders = [base]
         self._ids: dict[str, Element] = {}
         self._find_ids()
+        if left_out:
+            self._leave_out(left_out)
+
+    def _leave_out(self, includes: Sequence[Element]) -> None:
+        """Warn of files that are not included, and take away each ``<ref>`` to what may be in them."""
+        for element in includes:
+            self.notes.add(element, f"the file {element.attributes['filename']} is not there, and left out")
+        for element in walk(self.root):
+            for child in element.children:
+                if child.tag == "ref" and child.attributes.get("id", "") not in self._ids:
+                    self.notes.add(child, f"{child.attributes.get('id', '')} is not there, and left out")
+            element.children = [
+                child for child in element.children if child.tag != "ref" or child.attributes.get("id", "") in self._ids
+            ]
 
     def _find_ids(self) -> None:
         """Collect ids, ``<alias>`` and ``<path>``."""
