@@ -58,7 +58,7 @@ def perturb_normal(
     The heights of a bump map displace the surface along its normal (Blinn, *Simulation of Wrinkled Surfaces*, 1978). The back
     of a surface shows the mirror image. Where light passes, and if ``mirrored``, a perturbed normal that faces away from the
     viewer is mirrored about the unperturbed one (after Schuessler, Heitz, Hanika, Dachsbacher, *Microfacet-based Normal
-    Mapping*, 2017). So are Mitsuba's ``normalmap`` and ``bumpmap``. The picture jumps where mirroring begins, at no edge of
+    Mapping*, 2017), as in Mitsuba's ``normalmap`` and ``bumpmap``. The picture jumps where mirroring begins, at no edge of
     the geometry, and gradients miss that.
 
     Args:

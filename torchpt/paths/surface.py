@@ -82,9 +82,7 @@ class Surface:
 
     frame: Frame  # about the shading normal, flipped on the back unless the model transmits
     side: Tensor | None  # (N,) -1 on the back, else 1; None where the model transmits
-    outward: (
-        Tensor | None
-    )  # (3, N) normal on the side that is seen, which tells the side; None where the model transmits
+    outward: Tensor | None  # (3, N) normal by which the side is told, on that side; None where the model transmits
     front_mask: Tensor | None  # (N,) 0 on the back of one-sided surfaces; None where there are none
     parameters: bsdfs.Parameters  # parameters of the BSDF at each lane, textures included
     wo: Tensor  # (3, N) direction to the previous vertex, see `local_wo`

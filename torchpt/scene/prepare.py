@@ -134,8 +134,7 @@ def make_wave(
     attached: bool = False,
     like: Wave | None = None,
     rays: tuple[Tensor, Tensor] | None = None,
-    tree: bool = False,
-    alone: bool = False,
+    edges: bool = False,
 ) -> Wave:
     """Build the wave of a render.
 
@@ -148,8 +147,7 @@ def make_wave(
         attached: True where the geometry is differentiated.
         like: a wave that differs in the camera's parameters only; its world and search are used again.
         rays: origins and directions ``(..., 3)`` in the scene's coordinates, in place of the camera's.
-        tree: True to search a tree even where packets would be faster.
-        alone: True where lights are sampled alone too, whatever the integrator does.
+        edges: True for rays of edges: they search a tree even where packets would be faster, and sample lights alone too.
 
     Raises:
         SceneError: a direction that is zero, or a ray that is not finite.
@@ -163,14 +161,14 @@ def make_wave(
         uv = any(layer.uv for layer in surface_layers(settings).values())  # an AOV shows texture coordinates
         with one_thread() if scene.numbers <= QUICK_NUMBERS else nullcontext():
             world, geometry = scene.world(
-                dtype, world_params, uv=uv, choice=settings.light_choice, alone=alone or settings.lights_alone
+                dtype, world_params, uv=uv, choice=settings.light_choice, alone=edges or settings.lights_alone
             )
             threads = None if settings.render.threads == "auto" else int(settings.render.threads)
             surfaces_move = any(
                 name.startswith("shapes.") and scene.spec(name).moves is Moves.SURFACES for name in world_params
             )
             accel = scene.accel(settings.render.accel, threads, geometry if surfaces_move else None)
-            if tree and accel.name == "brute":  # it tests packets of rays against all primitives; `numba` is a tree
+            if edges and accel.name == "brute":  # it tests packets of rays against all primitives; `numba` is a tree
                 accel = scene.accel("numba", threads, geometry if surfaces_move else None)
         if integrator.light_walk() is not None:
             world = _with_emission(scene, world, geometry, own=own)

@@ -533,7 +533,7 @@ class Scene:
         """
         host = self._host_copies.of(params, self.params)
         own = frozenset(name for name, value in params.items() if self.params.get(name) is value)
-        reads = ParameterReads(host, self._pieces, own, variant=(dtype, uv, choice, alone))
+        reads = ParameterReads(host, self._pieces, own, variant=(dtype, uv))
         built, space = self._built, self._host_space
         made = assemble(
             built.parts,

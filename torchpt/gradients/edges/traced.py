@@ -243,6 +243,6 @@ def traced_of(scene: Scene, settings: Settings, params: Mapping[str, Tensor], dt
     """Return the wave of a scene under ``params``; its numbers are independent from sample to sample."""
     plain = replace(settings, sampler=ParsedParams(SAMPLERS["independent"], {}))
     # Packets search rays near an edge twice, and these all are.
-    wave = make_wave(scene, plain, params, dtype, tree=True, alone=True)
+    wave = make_wave(scene, plain, params, dtype, edges=True)
     wave = replace(wave, sampler=Sampler(wave.sampler.points, settings.render.seed))
     return Traced(wave, Along(scene, settings, wave))

@@ -19,6 +19,8 @@ from torchpt.core.errors import SceneError
 from torchpt.physics.bsdfs import Bsdf, Parameters
 from torchpt.physics.bsdfs.records import LaneMaterials
 from torchpt.physics.bsdfs.resolved import ResolvedMaterial
+from torchpt.physics.lights import KINDS as LIGHTS
+from torchpt.physics.lights.base import Environment
 from torchpt.physics.lights.records import Lights
 from torchpt.physics.parts import Copy, Part, Source
 from torchpt.physics.shapes.geometry import KINDS, Geometry, LaneGeometry
@@ -77,10 +79,10 @@ def assemble(
         SceneError: parameters with positions or sizes beyond the range of float32.
     """
     reads = parameters if isinstance(parameters, ParameterReads) else ParameterReads(parameters)
-    assembly = _Assembly(
-        parts, copies, sources, reads, space, dtype, uv=uv, choice=choice, alone=alone, own_models=own_models
-    )
-    return assembly.world(), assembly.geometry()
+    assembly = _Assembly(parts, copies, sources, reads, space, dtype, uv=uv, own_models=own_models)
+    # Of environments alone the light table depends on it: elsewhere both ways share their table.
+    alone = alone or not any(issubclass(LIGHTS[source.kind], Environment) for source in sources)
+    return assembly.world(choice, alone), assembly.geometry()
 
 
 class _Assembly(Pieced):
@@ -96,14 +98,12 @@ class _Assembly(Pieced):
         dtype: torch.dtype,
         *,
         uv: bool,
-        choice: str,
-        alone: bool,
         own_models: Sequence[Bsdf],
     ) -> None:
         super().__init__(parameters)
         self.parts, self.copies, self.sources = parts, copies, sources
         self.space, self.dtype, self.device = space, dtype, space.centre.device
-        self.uv, self.choice, self.alone, self.own_models = uv, choice, alone, own_models
+        self.uv, self.own_models = uv, own_models
         self.owners: list[Part | Copy] = [*parts, *copies]  # in the order of slots
 
     @cached_property
@@ -283,8 +283,8 @@ class _Assembly(Pieced):
     # -- lights, and all together
 
     @piece
-    def lights(self) -> Lights | None:
-        """Return the light table; None where nothing emits."""
+    def lights(self, choice: str, alone: bool) -> Lights | None:
+        """Return the light table; None where nothing emits. Arguments as for :func:`assemble`."""
         with self.parameters.structure_only():
             materials = self.lane_materials()
         opacity_mapped = any(
@@ -300,18 +300,18 @@ class _Assembly(Pieced):
             self.opacity(),
             emissive=self.dark() == 0,
             opacity_mapped=opacity_mapped,
-            choice=self.choice,
-            alone=self.alone,
+            choice=choice,
+            alone=alone,
         )
 
     @piece
-    def world(self) -> World:
-        """Return the world."""
+    def world(self, choice: str, alone: bool) -> World:
+        """Return the world; arguments as for :func:`assemble`."""
         return World(
             geometry=self.lane_geometry(),
             materials=self.lane_materials_of_slots(),
             textures=self.textures(),
-            lights=self.lights(),
+            lights=self.lights(choice, alone),
         )
 
 

@@ -131,9 +131,8 @@ def build(
     with torch.no_grad():
         light = _luminances(texels)
         zero = light.new_zeros(())
-        room = Distribution2D.room(
-            height - 1, width, light.device
-        )  # a map may be large: what is not kept is overwritten
+        # A map may be large: what is not kept is overwritten.
+        room = Distribution2D.room(height - 1, width, light.device)
         mean = sum_all(_weights(light, heights, room))
         black = not bool(mean > 0)
         compensated = plain = None
