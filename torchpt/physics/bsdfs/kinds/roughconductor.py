@@ -11,6 +11,7 @@ from torch import Tensor
 from torchpt.math import microfacet
 from torchpt.math.vectors import dot
 from torchpt.physics.bsdfs.base import Bsdf, Parameters, Values
+from torchpt.physics.bsdfs.kept_tables import keep_tables
 from torchpt.physics.bsdfs.lobes import mixture_sample, with_delta
 from torchpt.physics.bsdfs.metal import Metal, by_reflectance, metal_colour, metal_parameters, metal_split_sum
 from torchpt.physics.bsdfs.records import BsdfSample, SplitSumMaterial
@@ -78,6 +79,7 @@ class RoughConductor(Anisotropic, Metal):
         )
         return *plain, *compensated, *beckmann
 
+    @keep_tables
     def tabulate(self, values: Parameters) -> Parameters:
         """Return the table of directional albedo for energy compensation."""
         if not self.energy_compensation:

@@ -15,6 +15,7 @@ from torchpt.math import microfacet
 from torchpt.math.microfacet import INDEX_MATCHED, fresnel_dielectric, refract
 from torchpt.math.vectors import dot, normalize
 from torchpt.physics.bsdfs.base import Bsdf, Parameters, Values
+from torchpt.physics.bsdfs.kept_tables import keep_tables
 from torchpt.physics.bsdfs.lobes import (
     Glass,
     dielectric_parameters,
@@ -85,6 +86,7 @@ class RoughDielectric(Anisotropic, Glass):
         )
         return *ggx, *beckmann
 
+    @keep_tables
     def tabulate(self, values: Parameters) -> Parameters:
         """Return the table of directional albedo for energy compensation, one block for each side."""
         if not self.energy_compensation:

@@ -15,6 +15,7 @@ from torchpt.math.microfacet import fresnel_dielectric
 from torchpt.math.sampling import cosine_hemisphere
 from torchpt.math.vectors import dot
 from torchpt.physics.bsdfs.base import Bsdf, Parameters, Table, Values
+from torchpt.physics.bsdfs.kept_tables import keep_tables
 from torchpt.physics.bsdfs.lobes import (
     Coat,
     coat_parameters,
@@ -62,6 +63,7 @@ class RoughPlastic(Rough, Coat):
         """See :meth:`Bsdf.variants`."""
         return cls(), cls(nonlinear=True), cls(beckmann=True)
 
+    @keep_tables
     def tabulate(self, values: Parameters) -> Parameters:
         """Return the coat's ``transmittance`` by cosine, and ``inner``, its mean reflectance for diffuse light from below."""
         eta = values["int_ior"] / values["ext_ior"]
