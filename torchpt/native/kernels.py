@@ -16,6 +16,7 @@ import os
 import re
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +25,7 @@ import numpy as np
 from torchpt.core.threads import parallel_for
 from torchpt.native import cache, compile_time, machine
 
-__all__ = ["FOLDER", "Kernel", "kernel", "read_module", "run_parallel"]
+__all__ = ["FOLDER", "Kernel", "bound_to", "kernel", "read_module", "run_parallel"]
 
 FOLDER = Path(__file__).with_name("ir")
 #: Parts into which the work is cut for each thread. Items differ in cost, so a thread that finishes early takes another part.
@@ -162,6 +163,21 @@ def _load(module: str) -> dict[str, Kernel]:
         name: Kernel(name, [_Argument.parse(text) for text in arguments.split(", ")], address_of_function(name), engine)
         for name, arguments in _SIGNATURE.findall(head)
     }
+
+
+def bound_to(kernel: Kernel, memory: int, args: tuple[Any, ...]) -> Callable[[int], None]:
+    """Return a function that runs a kernel over ``range(items)`` in the calling thread; arguments as for :func:`run_parallel`.
+
+    They are checked once, for kernels that are called often with the same arrays. It has scratch memory of its own, so two
+    threads must not call it at once.
+    """
+    scratch = np.empty(memory, np.uint8)
+    words, call = kernel.words(0, 0, address_of(scratch), *args)[2:], kernel.call
+
+    def run(items: int, _kept: Any = (scratch, args)) -> None:
+        call(0, items, *words)
+
+    return run
 
 
 def run_parallel(kernel: Kernel, items: int, threads: int, grain: int, memory: int, args: tuple[Any, ...]) -> None:

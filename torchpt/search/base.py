@@ -8,6 +8,7 @@ the workers of the engine of kernels.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -16,10 +17,13 @@ from torch import Tensor
 
 from torchpt.physics.shapes.geometry import Geometry
 
-__all__ = ["Accel", "Array", "Hits", "mark_non_opaque"]
+__all__ = ["Accel", "Array", "Hits", "Search", "mark_non_opaque"]
 
 #: A numpy array, float32 or int32.
 Array = np.ndarray[Any, Any]
+
+#: Searches the first rays of arrays, as many as it is given.
+Search = Callable[[int], None]
 
 #: ``t`` (N,) float32, ``prim`` (N,) int32, ``u`` (N,) and ``v`` (N,) float32: distance, primitive id, and parameters of the
 #: point on the primitive (:class:`torchpt.physics.shapes.geometry.Geometry`). See :class:`Accel`.
@@ -68,6 +72,13 @@ class Accel(ABC):
         for out, result in zip((t, prim, u, v), self.intersect(*rays), strict=True):
             out[:count] = result.numpy()
 
+    def nearest_in(self, o: Array, d: Array, t_max: Array, t: Array, prim: Array, u: Array, v: Array) -> Search:
+        """Return a function of ``count`` that does what :meth:`nearest` does in these arrays, for one thread.
+
+        It is quicker to call where there are few rays.
+        """
+        return lambda count: self.nearest(o, d, t_max, count, t, prim, u, v)
+
     def refit(self, geometry: Geometry, threads: int | None = None) -> Accel | None:
         """Return a structure for primitives that have moved, refitted from this one, which is not changed and may be in use.
 
@@ -99,6 +110,10 @@ class Accel(ABC):
         rays = (torch.from_numpy(x[..., :count]) for x in (o, d, t_max))
         out[:count] = self.occluded(*rays).numpy()
         mark_non_opaque(out[:count], non_opaque)
+
+    def blocked_in(self, o: Array, d: Array, t_max: Array, out: Array, non_opaque: Array | None = None) -> Search:
+        """Return a function of ``count`` that does what :meth:`blocked` does in these arrays, as :meth:`nearest_in`."""
+        return lambda count: self.blocked(o, d, t_max, count, out, non_opaque)
 
     @abstractmethod
     def _intersect(self, o: Tensor, d: Tensor, t_max: Tensor) -> Hits: ...

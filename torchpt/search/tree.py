@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from torchpt.core.threads import thread_count
-from torchpt.native.kernels import kernel, run_parallel
+from torchpt.native.kernels import bound_to, kernel, run_parallel
 from torchpt.physics.shapes.geometry import Geometry
-from torchpt.search.base import Accel, Array, Hits
+from torchpt.search.base import Accel, Array, Hits, Search
 from torchpt.search.bounds import select_primitives
 from torchpt.search.tree_build import (
     Floats,
@@ -182,6 +182,17 @@ class WideBvh(Accel):
         """See :meth:`Accel.blocked`."""
         flags = _ALL_OPAQUE if non_opaque is None else non_opaque
         self._run("occluded", count, 1, o, d, t_max, flags, len(flags), out)
+
+    def nearest_in(self, o: Array, d: Array, t_max: Array, t: Array, prim: Array, u: Array, v: Array) -> Search:
+        """See :meth:`Accel.nearest_in`."""
+        args = (o, d, t_max, d.shape[1], self.words, t, prim, u, v)
+        return bound_to(kernel("tree_nearest", "nearest"), packet_memory(self.stack_length), args)
+
+    def blocked_in(self, o: Array, d: Array, t_max: Array, out: Array, non_opaque: Array | None = None) -> Search:
+        """See :meth:`Accel.blocked_in`."""
+        flags = _ALL_OPAQUE if non_opaque is None else non_opaque
+        args = (o, d, t_max, d.shape[1], self.words, flags, len(flags), out)
+        return bound_to(kernel("tree_occluded", "occluded"), packet_memory(self.stack_length), args)
 
     def _run(self, name: str, count: int, threads: int, o: Array, d: Array, t_max: Array, *results: Any) -> None:
         """Search with the kernel ``name``; the arrays may be longer than the number of rays."""

@@ -204,7 +204,8 @@ class KernelsEngine:
         size += 0 if self.light_paths is None else self.light_paths.unbind()
         self.calls.unbind()
         self.splats, self._lost, self.sent, self.traced = [], [], None, None
-        del self.kernels, self.wave, self.search.kernels, self.context
+        self.search.unbind()
+        del self.kernels, self.wave, self.context
         return size
 
     def memories(self) -> list[Memory]:
@@ -217,7 +218,7 @@ class KernelsEngine:
         """Reuse the memory for another render of the same structure, after `unbind`."""
         self.kernels, self.wave, self.context = kernels, kernels.wave, kernels.wave.context
         self.calls.rebind(kernels, halt)
-        self.search.kernels = kernels
+        self.search.rebind(kernels)
         if self.light_paths is not None:
             assert kernels.light_paths is not None
             self.light_paths.rebind(kernels.light_paths, halt)

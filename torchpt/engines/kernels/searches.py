@@ -10,7 +10,8 @@ import numpy as np
 
 from torchpt.engines.kernels.calls import Calls, LaneCount
 from torchpt.engines.kernels.layout import Memory, Rows
-from torchpt.search import Accel
+from torchpt.engines.kernels.programs import Kernels
+from torchpt.search.base import Search
 
 __all__ = ["ChunkSearch"]
 
@@ -28,9 +29,19 @@ class ChunkSearch:
 
     def __init__(self, calls: Calls) -> None:
         self.calls, self.kernels = calls, calls.kernels
+        self._bound: dict[tuple[int, str], Search] = {}  # searches in memory, by its address and the rays in it
         arenas = 2 if self.kernels.has_transmission else 0
         self.passed = [calls.memory(self.kernels.passed.count) for _ in range(arenas)]
         self.transmitting = calls.memory(1)
+
+    def unbind(self) -> None:
+        """Drop all references to the render."""
+        del self.kernels
+        self._bound.clear()
+
+    def rebind(self, kernels: Kernels) -> None:
+        """Search for another render of the same structure, after :meth:`unbind`."""
+        self.kernels = kernels
 
     def nearest(self, arena: Memory, count: LaneCount) -> None:
         """Find the nearest hits, opaque or not, of the arena's rays, and write them to the arena."""
@@ -98,24 +109,30 @@ class ChunkSearch:
     # -- searches by the acceleration structure, outside of kernels
 
     def _nearest_outside(self, memory: Memory, rows: Rows, o: str, d: str, t_max: str, count: LaneCount) -> None:
-        accel: Accel = self.kernels.wave.accel
-        floats, words = memory.floats, memory.words
-        accel.nearest(
-            _row(floats, rows, o, 3),
-            _row(floats, rows, d, 3),
-            _row(floats, rows, t_max, 1)[0],
-            count,
-            _row(floats, rows, "t", 1)[0],
-            _row(words, rows, "prim", 1)[0],
-            _row(floats, rows, "u", 1)[0],
-            _row(floats, rows, "v", 1)[0],
-        )
+        key = memory.address, o
+        search = self._bound.get(key)
+        if search is None:
+            floats, words = memory.floats, memory.words
+            search = self._bound[key] = self.kernels.wave.accel.nearest_in(
+                _row(floats, rows, o, 3),
+                _row(floats, rows, d, 3),
+                _row(floats, rows, t_max, 1)[0],
+                _row(floats, rows, "t", 1)[0],
+                _row(words, rows, "prim", 1)[0],
+                _row(floats, rows, "u", 1)[0],
+                _row(floats, rows, "v", 1)[0],
+            )
+        search(count)
 
     def _occluded_outside(self, arena: Memory, count: LaneCount) -> None:
-        kernels, rows = self.kernels, self.kernels.state
-        o, d, t_max = (_row(arena.floats, rows, f"shadow_{name}", n) for name, n in (("o", 3), ("d", 3), ("t", 1)))
-        blocked = _row(arena.words, rows, "blocked", 1)[0]
-        kernels.wave.accel.blocked(o, d, t_max[0], count, blocked, kernels.non_opaque)
+        key = arena.address, "shadow_o"
+        search = self._bound.get(key)
+        if search is None:
+            kernels, rows = self.kernels, self.kernels.state
+            o, d, t_max = (_row(arena.floats, rows, f"shadow_{name}", n) for name, n in (("o", 3), ("d", 3), ("t", 1)))
+            blocked = _row(arena.words, rows, "blocked", 1)[0]
+            search = self._bound[key] = kernels.wave.accel.blocked_in(o, d, t_max[0], blocked, kernels.non_opaque)
+        search(count)
 
 
 def _row(memory: np.ndarray, rows: Rows, name: str, count: int) -> np.ndarray:
