@@ -36,7 +36,8 @@ def sample(x: Tensor, centre: Tensor, radius: Tensor, flip: Tensor, u: Tensor) -
     axis, distance, outside, width = _cone(x, centre, radius)
     local = uniform_cone(u, width)
     sin2 = local[0] * local[0] + local[1] * local[1]
-    half = (radius * radius - sin2 * distance * distance).clamp_min(0.0).sqrt()
+    # sqrt(r^2 - (distance sin)^2), and at the limb not the root of a rounding error, by which derivatives would be divided.
+    half = distance * (width * (1.0 - u[0]) * (2.0 - width * (1.0 + u[0]))).clamp_min(0.0).sqrt()
     depth = distance * local[2] - half
     # From the centre to the point, in the cone's frame: z is depth cos - distance, written without cancellation.
     seen = torch.stack((local[0] * depth, local[1] * depth, -(sin2 * distance + local[2] * half)))

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchpt.math.vectors import azimuth, cross, dot, normalize, take
 from torchpt.physics.shapes.geometry import KINDS, Interaction
 from torchpt.physics.shapes.primitive import Corners, FixedPoints, HitPoints, LanePrimitives, Primitive, Rays, Triple
-from torchpt.physics.shapes.quadrics import polar
+from torchpt.physics.shapes.quadrics import polar, resolvable_slope
 from torchpt.physics.world import World
 
 if TYPE_CHECKING:
@@ -110,5 +110,6 @@ def _distance(o: Tensor, d: Tensor, centre: Tensor, radius: Tensor, found: Tenso
     t = found.detach()
     f = o + d * t - centre
     # One Newton step on |f|^2 = r^2 with a detached slope: it refines the value and gives the exact derivative.
-    slope = (2.0 * dot(f, d)).detach()
-    return t - (dot(f, f) - radius * radius) / torch.where(slope == 0, 1.0, slope)
+    away, size = (o - centre).detach(), radius.detach()
+    slope = resolvable_slope((2.0 * dot(f, d)).detach(), 2.0 * size, dot(away, away).sqrt() / size)
+    return t - (dot(f, f) - radius * radius) / slope
