@@ -51,6 +51,39 @@ def test_standard_errors_are_those_of_seeds():
     assert ((spread / expected > 0.4) & (spread / expected < 1.9)).all()  # 10 seeds know a spread to 24 %
 
 
+def test_standard_errors_know_the_noise_of_the_picture():
+    """Near the minimum of a squared error almost all of the spread comes from the picture that it is taken of."""
+    loaded = scene()
+    target = torchpt.render(loaded, spp=512, seed=99, threads=1)
+    found, said = list[Tensor](), list[Tensor]()
+    for seed in range(12):
+        estimate = torchpt.gradient(
+            loaded, lambda picture: (picture - target).square().mean(), [FLOOR], spp=8, passes=4, seed=seed, threads=1
+        )
+        found.append(estimate.gradients[FLOOR].double())
+        said.append(estimate.standard_errors[FLOOR].double())
+    spread, expected = torch.stack(found).std(0), torch.stack(said).square().mean(0).sqrt()
+    assert ((spread / expected > 0.4) & (spread / expected < 1.9)).all()  # 12 seeds know a spread to 21 %
+
+
+def test_linear_losses_take_no_more_passes(monkeypatch: pytest.MonkeyPatch):
+    calls = list[dict[str, Any]]()
+
+    def counted(*given: Any, **wish: Any) -> Tensor:
+        calls.append(wish)
+        return torchpt.render(*given, **wish)
+
+    monkeypatch.setattr(estimates, "render", counted)
+    loaded, count = scene(), {}
+    for name, loss in {"linear": lambda p: p.mean(), "square": lambda p: p.square().mean()}.items():
+        calls.clear()
+        torchpt.gradient(loaded, loss, [FLOOR], spp=4, passes=4, threads=1)
+        count[name] = len(calls)
+        seeds = [wish.get("seed_grad", wish["seed"]) for wish in calls]
+        assert len(set(seeds)) == len(seeds)  # independent of each other
+    assert count == {"linear": 1 + 1 + 4, "square": 1 + 4 + 4 + 2}
+
+
 def test_the_mean_is_renders_gradient():
     loaded = scene()
     estimate = torchpt.gradient(loaded, lambda picture: picture.square().mean(), [FLOOR], spp=64, threads=1)
@@ -92,6 +125,8 @@ def test_robust_means(monkeypatch: pytest.MonkeyPatch):
     assert median.gradients["x"].tolist() == pytest.approx([1.1, 2.0])
     clipped = passes(monkeypatch, values, grad_clip=2.0)
     assert clipped.clipped == 1 and clipped.gradients["x"].norm() < 3
+    rare = [[0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [100.0, 0.0]]
+    assert passes(monkeypatch, rare, grad_clip=2.0).gradients["x"].tolist() == [25.0, 0.0]
     broken = passes(monkeypatch, [*values[:3], [float("nan"), 0.0]])
     assert broken.not_finite == 1 and broken.gradients["x"].tolist() == pytest.approx([1.0, 2.0])
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,7 +36,8 @@ class GradientEstimate:
     Attributes:
         loss: value of the loss; None where a cotangent was given.
         gradients: by name of the parameter, in the shape of its value.
-        standard_errors: of each number of the gradients; those of the mean, also where ``combine`` is ``median``.
+        standard_errors: of each number of the gradients, the noise of the picture that the loss was taken of included; those of
+            the mean, also where ``combine`` is ``median``.
         passes: number of independent passes.
         spp: samples a pixel of each pass.
         clipped: number of gradients, of a parameter in a pass, that ``grad_clip`` made shorter.
@@ -74,24 +75,28 @@ def gradient(
 ) -> GradientEstimate:
     """Return the gradient of a loss of the picture, with its standard errors, by independent passes.
 
-    The mean over passes has no bias. Outliers move it as much as they are large; two ways to combine passes are moved less,
-    and are biased toward what most passes say, the more so the more skew their distribution is: ``combine="median"`` takes
-    the median of the passes, number by number (each of which is a mean over its samples: a median of means), and ``grad_clip``
-    shortens gradients that are long beside those of the other passes. Both errors fall as passes get more samples.
+    The mean over passes has no bias for the cotangent that it is taken of. That of a loss which is not linear varies with the
+    noise of the picture. This noise is part of the standard errors, rather too large than too small, as it is taken of pictures
+    of fewer samples; it costs as many samples as the picture has, and half as many passes more.
+    Outliers move the mean as much as they are large; two ways to combine passes are moved less, and are biased toward what most
+    passes say, the more so the more skew their distribution is: ``combine="median"`` takes the median of the passes, number by
+    number (each of which is a mean over its samples: a median of means), and ``grad_clip`` shortens gradients that are long
+    beside those of the other passes. Both errors fall as passes get more samples.
 
     Under ``torch.no_grad`` and in inference mode it does the same: what it returns needs no gradients.
 
     Args:
         scene: from :func:`torchpt.load`.
-        loss: function of the picture ``(H, W, 3)`` that returns a number, evaluated once, on a picture of ``spp`` samples a
-            pixel; or the cotangent of the picture, ``(H, W, 3)``.
+        loss: function of the picture ``(H, W, 3)`` that returns a number; it is taken of a picture of ``spp`` samples a pixel,
+            and, to know its noise, of others; or the cotangent of the picture, ``(H, W, 3)``.
         params: values in place of ``scene.params`` by name, or names of these, also one name, and patterns such as
             ``materials.*.reflectance``; all are differentiated.
         spp: samples a pixel of the picture, and of all passes together.
         passes: number of independent passes, at least 2. Each takes ``spp / passes`` samples a pixel, rounded up.
         seed: see :func:`torchpt.render`.
         combine: ``mean`` or ``median``.
-        grad_clip: longest gradient of a parameter in a pass, in units of the median length over passes; None: any.
+        grad_clip: longest gradient of a parameter in a pass, in units of the median length over passes, unless that is 0; None:
+            any.
         options: further options of :func:`torchpt.render`. An ``edge_guide`` learns from pass to pass, so the first ones vary
             more, which ``median`` and ``grad_clip`` do not know.
 
@@ -117,12 +122,17 @@ def gradient(
         values = {name: _leaf(value) for name, value in _named(scene, params).items()}
         if not values:
             raise SceneError("params", params, "at least one name of scene.params")
-        found = None
+        takes = _Passes(scene, values, share, first, options)
+        found, changes = None, list[Tensor]()
         if not isinstance(loss, Tensor):
             with torch.no_grad():
                 picture = render(scene, params=values, spp=spp, seed=first, **options)
-            found, loss = _cotangent(loss, picture)
-        each = _by_passes(scene, loss, values, [share] * passes, first, options)
+            found, cotangent = _cotangent(loss, picture)
+            changes = _changes(loss, cotangent, takes.pictures(passes, number=passes + 1))
+        else:
+            cotangent = loss
+        each = takes.gradients([cotangent] * passes, number=1)
+        noise = takes.gradients(changes, number=2 * passes + 1)
     not_finite = sum(passes - len(grads) for grads in each.values())
     for name, grads in each.items():
         if len(grads) < 2:
@@ -134,46 +144,92 @@ def gradient(
             stack = torch.stack(shorter)
             whole = stack.mean(0) if combine == "mean" else _median(stack)
             gradients[name] = whole.to(values[name])
-            errors[name] = (stack.std(0) / len(shorter) ** 0.5).to(values[name])
+            variance = stack.var(0) / len(shorter)
+            if noise[name]:
+                variance = variance + torch.stack(noise[name]).square().mean(0)
+            errors[name] = variance.sqrt().to(values[name])
             clipped += count
     return GradientEstimate(found, gradients, errors, passes, share, clipped, not_finite)
 
 
-def _by_passes(
-    scene: Scene,
-    cotangent: Tensor,
-    values: Mapping[str, Tensor],
-    samples: Iterable[int],
-    seed: int,
-    options: Mapping[str, Any],
-) -> dict[str, list[Tensor]]:
-    """Return the gradients of all passes by name, without those that are not finite.
+@dataclass(frozen=True)
+class _Passes:
+    """Independent renders, each with a seed of its own, by its number.
+
+    Attributes:
+        scene: the scene.
+        values: of the parameters.
+        spp: samples a pixel of a render.
+        seed: of the whole.
+        options: further options of ``render``.
+    """
+
+    scene: Scene
+    values: Mapping[str, Tensor]
+    spp: int
+    seed: int
+    options: Mapping[str, Any]
+
+    def _seed(self, number: int) -> int:
+        return (self.seed + number * _STRIDE) % (1 << 32)
+
+    def pictures(self, count: int, number: int) -> Iterator[Tensor]:
+        """Yield pictures ``(H, W, 3)``; ``number``: of the first."""
+        for own in range(number, number + count):
+            with torch.no_grad():
+                yield render(self.scene, params=self.values, spp=self.spp, seed=self._seed(own), **self.options)
+
+    def gradients(self, cotangents: Iterable[Tensor], number: int) -> dict[str, list[Tensor]]:
+        """Return gradients by name for cotangents of the picture, without those that are not finite.
+
+        Args:
+            cotangents: one a render.
+            number: of the first render.
+
+        Raises:
+            SceneError: a cotangent of another shape than the picture's.
+        """
+        each: dict[str, list[Tensor]] = {name: [] for name in self.values}
+        for own, cotangent in enumerate(cotangents, number):
+            leaves = {name: value.clone().requires_grad_() for name, value in self.values.items()}
+            seeds = {"spp": 1, "seed": self.seed, "spp_grad": self.spp, "seed_grad": self._seed(own)}
+            picture = render(self.scene, params=leaves, **seeds, **self.options)
+            if cotangent.shape != picture.shape:
+                shape = f"a tensor of shape {tuple(cotangent.shape)}"
+                raise SceneError("loss", shape, f"one of the picture's, {tuple(picture.shape)}")
+            grads = gradients_of([picture], list(leaves.values()), [cotangent.to(picture)])
+            for name, grad in zip(leaves, grads, strict=True):
+                grad = torch.zeros_like(leaves[name]) if grad is None else grad
+                if bool(torch.isfinite(grad).all()):
+                    each[name].append(grad.double())
+        return each
+
+
+def _changes(loss: Callable[[Tensor], Tensor], cotangent: Tensor, pictures: Iterator[Tensor]) -> list[Tensor]:
+    """Return changes of the cotangent that are as large as its noise: differences of those of halves of some pictures.
 
     Args:
-        scene: the scene.
-        cotangent: of the picture.
-        values: of the parameters.
-        samples: samples a pixel of each pass.
-        seed: of the picture; each pass has one of its own.
-        options: further options of ``render``.
+        loss: function of a picture.
+        cotangent: of a picture of as many samples as all of ``pictures`` have.
+        pictures: independent ones ``(H, W, 3)``, two at least.
 
-    Raises:
-        SceneError: a cotangent of another shape than the picture's.
+    Returns:
+        Half as many as pictures, of different halves; none where the cotangent does not vary, as of linear losses.
     """
-    each: dict[str, list[Tensor]] = {name: [] for name in values}
-    for number, spp in enumerate(samples):
-        leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
-        own = (seed + (number + 1) * _STRIDE) % (1 << 32)
-        picture = render(scene, params=leaves, spp=1, seed=seed, spp_grad=spp, seed_grad=own, **options)
-        if cotangent.shape != picture.shape:
-            shape = f"a tensor of shape {tuple(cotangent.shape)}"
-            raise SceneError("loss", shape, f"one of the picture's, {tuple(picture.shape)}")
-        grads = gradients_of([picture], list(leaves.values()), [cotangent.to(picture)])
-        for name, grad in zip(leaves, grads, strict=True):
-            grad = torch.zeros_like(leaves[name]) if grad is None else grad
-            if bool(torch.isfinite(grad).all()):
-                each[name].append(grad.double())
-    return each
+    first = next(pictures)
+    if torch.equal(_cotangent(loss, first)[1], cotangent):
+        return []
+    stack = torch.stack([first, *pictures])
+    count, half = len(stack), len(stack) // 2
+    generator = torch.Generator().manual_seed(count)
+    # The difference of means over a and b pictures has the variance 1/a + 1/b of a single one's, the mean of all 1 / (a + b).
+    factor = (half * (count - half)) ** 0.5 / count
+    changes = []
+    for _ in range(half):
+        order = torch.randperm(count, generator=generator).to(stack.device)
+        one, other = (_cotangent(loss, stack[part].mean(0))[1] for part in (order[:half], order[half:]))
+        changes.append((one - other) * factor)
+    return changes
 
 
 def _named(scene: Scene, params: Any) -> Mapping[str, Any]:
@@ -221,6 +277,8 @@ def _clipped(grads: list[Tensor], most: float | None) -> tuple[list[Tensor], int
         return grads, 0
     lengths = [float(grad.norm()) for grad in grads]
     limit = most * statistics.median(lengths)
+    if limit == 0:  # most passes found nothing, which says nothing of how long the others may be
+        return grads, 0
     shorter = [grad * (limit / length) if length > limit else grad for grad, length in zip(grads, lengths, strict=True)]
     return shorter, sum(length > limit for length in lengths)
 
