@@ -199,7 +199,8 @@ class RenderDataset(Dataset):
         layers: names of AOVs (``film.aovs``).
         seed: seed of item 0; any integer from 0, also as a tensor.
         device: device on which mappings are loaded.
-        options: further arguments of ``torchpt.render``.
+        options: further arguments of ``torchpt.render``; not ``checkpoint``, nor those of gradients alone (``edge_guide``,
+            ``seed_grad``, ``spp_grad``), which items do not have.
 
     Raises:
         SceneError: an argument is not accepted; on access, as ``load`` and ``render``, with ``make(index)`` in its key.
