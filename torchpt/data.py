@@ -18,6 +18,7 @@ from functools import partial
 from itertools import islice
 from typing import Any, NamedTuple, Unpack
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import Dataset, IterableDataset, get_worker_info
@@ -198,7 +199,8 @@ class RenderDataset(Dataset):
         layers: names of AOVs (``film.aovs``).
         seed: seed of item 0; any integer from 0, also as a tensor.
         device: device on which mappings are loaded.
-        options: further arguments of ``torchpt.render``.
+        options: further arguments of ``torchpt.render``; not ``checkpoint``, nor those of gradients alone (``edge_guide``,
+            ``seed_grad``, ``spp_grad``), which items do not have.
 
     Raises:
         SceneError: an argument is not accepted; on access, as ``load`` and ``render``, with ``make(index)`` in its key.
@@ -288,8 +290,7 @@ class RenderStream(IterableDataset):
             raise SceneError("scenes", scenes, "a whole number >= 0, or None for no end")
         if type(start) is not int or start < 0:
             raise SceneError("start", start, "a whole number >= 0")
-        if shard is not None and not 0 <= shard[0] < shard[1]:
-            raise SceneError("shard", shard, "(rank, world) with 0 <= rank < world")
+        shard = None if shard is None else _shard(shard)
         self._items = _ItemRenderer("RenderStream", make, cameras, spp, layers, seed, device, options)
         self.scenes = scenes
         self.start, self.shard = start, shard
@@ -456,8 +457,12 @@ def _check_options(options: Mapping[str, Any], where: str = "") -> None:
     film, params = film_keys(options.get("film")), options.get("params")
     if "full" in options:
         raise SceneError(f"{where}full", options["full"], "none: an item holds the picture and its layers")
-    if options.get("edge_guide") is not None:
-        raise SceneError(f"{where}edge_guide", options["edge_guide"], "none: pictures of a data set have no gradients")
+    for key in ("edge_guide", "seed_grad", "spp_grad"):
+        if options.get(key) is not None:
+            raise SceneError(f"{where}{key}", options[key], "none: pictures of a data set have no gradients")
+    if options.get("checkpoint") is not None:
+        expected = "none: a file of one picture, which the items would share"
+        raise SceneError(f"{where}checkpoint", options["checkpoint"], expected)
     if film is not None and not isinstance(film, Mapping):
         raise SceneError(f"{where}film", film, "(width, height), or a mapping of film settings")
     if params is not None and not isinstance(params, Mapping):
@@ -472,12 +477,17 @@ def _check_options(options: Mapping[str, Any], where: str = "") -> None:
 
 def _camera_params(cameras: Any) -> list[Mapping[str, Any]]:
     """Return each camera as parameters of a scene."""
+    expected = "a sequence of poses (4, 4) or of mappings of camera.* parameters, or a tensor (C, 4, 4)"
     if isinstance(cameras, str | Mapping) or not isinstance(cameras, Iterable):
-        raise SceneError("cameras", cameras, "a sequence of poses (4, 4) or of mappings of camera.* parameters")
+        raise SceneError("cameras", cameras, expected)
+    if isinstance(cameras, Tensor | np.ndarray) and cameras.ndim != 3:
+        raise SceneError("cameras", tuple(cameras.shape), expected)
     found: list[Mapping[str, Any]] = []
     for c, camera in enumerate(cameras):
         if not isinstance(camera, Mapping):
             shape = tuple(_tensor(f"cameras[{c}]", camera, torch.float64).shape)
+            if shape == (4,):  # a row of a single pose
+                raise SceneError("cameras", cameras, expected)
             if shape != (4, 4):
                 raise SceneError(f"cameras[{c}]", f"shape {shape}", "a pose (4, 4) or a mapping of camera.* parameters")
             camera = {"camera.to_world": camera}
@@ -486,6 +496,21 @@ def _camera_params(cameras: Any) -> list[Mapping[str, Any]]:
             raise SceneError(f"cameras[{c}]", list(camera), expected)
         found.append(camera)
     return found
+
+
+def _shard(shard: Any) -> tuple[int, int]:
+    """Return rank and number of ranks.
+
+    Raises:
+        SceneError: no pair of whole numbers with ``0 <= rank < world``.
+    """
+    try:
+        rank, world = map(operator.index, shard)
+    except (TypeError, ValueError):
+        rank, world = 0, 0
+    if not 0 <= rank < world:
+        raise SceneError("shard", shard, "(rank, world) with 0 <= rank < world")
+    return rank, world
 
 
 def _tensor(key: str, value: Any, dtype: torch.dtype) -> Tensor:

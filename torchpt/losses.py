@@ -12,9 +12,12 @@ such as ``Scene.faces`` returns.
 
 from __future__ import annotations
 
+from numbers import Real
+
 import torch
 from torch import Tensor
 
+from torchpt.core.autograd import is_transformed
 from torchpt.core.errors import ArgumentTypeError, ArgumentValueError
 from torchpt.images.metrics import FLOOR, relative, symmetric
 from torchpt.math.laplacian import adjacent_faces, cotangent_weights, mesh_edges, neighbour_sums
@@ -30,6 +33,9 @@ __all__ = [
     "unbiased_relmse",
     "unbiased_squared_error",
 ]
+
+#: Twice the area of a face that has no normal, at most, over the square of its longest edge; in rounding errors of its dtype.
+_FLAT_FACE = 8.0
 
 
 def _check_pictures(*pictures: Tensor) -> None:
@@ -126,14 +132,36 @@ def _check_mesh(vertices: Tensor, faces: Tensor) -> Tensor:
     return faces.to(vertices.device)
 
 
-def mesh_edge_loss(vertices: Tensor, faces: Tensor, target_length: float = 0.0) -> Tensor:
+def _check_length(key: str, value: float | Tensor) -> None:
+    """Raise ArgumentTypeError or ArgumentValueError unless a value is a finite number from 0, also as a tensor of one."""
+    expected = "a finite number >= 0"
+    if isinstance(value, Tensor):
+        if value.numel() != 1 or value.is_complex() or value.dtype == torch.bool:
+            raise ArgumentTypeError(key, (tuple(value.shape), value.dtype), f"{expected}, also as a tensor of one")
+        if is_transformed(value):  # its number is not known
+            return
+        value = float(value.detach())
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise ArgumentTypeError(key, value, expected)
+    if not 0.0 <= value < float("inf"):
+        raise ArgumentValueError(key, value, expected)
+
+
+def mesh_edge_loss(vertices: Tensor, faces: Tensor, target_length: float | Tensor = 0.0) -> Tensor:
     """Return the mean of ``(length - target_length)²`` over the edges of a mesh; 0 without edges.
 
+    Args:
+        vertices: ``(V, 3)``.
+        faces: ``(F, 3)``.
+        target_length: a finite number from 0, also as a tensor of one, to which gradients flow.
+
     Raises:
-        SceneError: vertices are no floating tensor, or faces no tensor of whole numbers, also a ``TypeError`` (all losses of
-            meshes raise it); a wrong shape, or an index that is out of range, also a ``ValueError``.
+        SceneError: vertices are no floating tensor, faces no tensor of whole numbers (all losses of meshes raise it), or the
+            length no number, also a ``TypeError``; a wrong shape, an index that is out of range, or a length that is, also a
+            ``ValueError``.
     """
     faces = _check_mesh(vertices, faces)
+    _check_length("target_length", target_length)
     if not len(faces):
         return 0.0 * vertices.sum()
     i, j = mesh_edges(faces).unbind(1)
@@ -168,14 +196,32 @@ def mesh_laplacian_smoothing(vertices: Tensor, faces: Tensor, method: str = "uni
 def mesh_normal_consistency(vertices: Tensor, faces: Tensor) -> Tensor:
     """Return the mean of ``1 - cos(angle between normals)`` over pairs of faces with a common edge; 0 without such pairs.
 
-    The normals of a pair are those on one side of it, whatever the order of the faces' vertices. Faces without area count as
-    perpendicular to all others.
+    The normals of a pair are those on one side of it, whatever the order of the faces' vertices. Faces without area, within
+    rounding, count as perpendicular to all others, and have no gradient.
     """
     faces = _check_mesh(vertices, faces)
     edges, opposite = adjacent_faces(faces)
     if not len(edges):
         return 0.0 * vertices.sum()
     start, end, a, b = (vertices[index] for index in (*edges.unbind(1), *opposite.unbind(1)))
-    first = torch.linalg.cross(end - start, a - start)
-    second = -torch.linalg.cross(end - start, b - start)
-    return (1.0 - torch.nn.functional.cosine_similarity(first, second, dim=1)).mean()
+    (first, first_is_flat), (second, second_is_flat) = (_unit_normals(end - start, apex - start) for apex in (a, b))
+    cosines = torch.where(first_is_flat | second_is_flat, 0.0, -(first * second).sum(1))
+    return (1.0 - cosines).mean()
+
+
+def _unit_normals(u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the normals ``(N, 3)`` of triangles with edges u and v, and whether they have no area ``(N,)``.
+
+    A triangle without area has another normal, without a gradient.
+    """
+    with torch.no_grad():  # in units of the triangle: a square of small numbers would be 0
+        size = torch.cat((u, v), 1).abs().amax(1, keepdim=True)
+        size = torch.where(size > 0, size, 1.0)
+    u, v = u / size, v / size
+    normals = torch.linalg.cross(u, v)
+    with torch.no_grad():
+        longest = torch.stack([edge.square().sum(1) for edge in (u, v, v - u)]).amax(0)
+        twice_areas = torch.linalg.vector_norm(normals, dim=1)
+        is_flat = twice_areas <= _FLAT_FACE * torch.finfo(u.dtype).eps * longest
+    normals = torch.where(is_flat[:, None], torch.ones_like(normals), normals)
+    return normals / torch.linalg.vector_norm(normals, dim=1, keepdim=True), is_flat

@@ -134,11 +134,51 @@ def test_indices_of_arrays_and_tensors():
 
 @pytest.mark.parametrize(
     ("wish", "key"),
-    [({"seed": -1}, "seed"), ({"full": True}, "full"), ({"params": {}}, "params"), ({"scenes": -1}, "scenes")],
+    [
+        ({"seed": -1}, "seed"),
+        ({"full": True}, "full"),
+        ({"params": {}}, "params"),
+        ({"scenes": -1}, "scenes"),
+        ({"checkpoint": "x"}, "checkpoint"),
+        ({"seed_grad": 3}, "seed_grad"),
+        ({"spp_grad": 3}, "spp_grad"),
+    ],
+    ids=str,
 )
 def test_arguments_that_are_not_accepted(wish, key):
     with pytest.raises(SceneError, match=f"^{key}: expected"):
         RenderDataset(room, **{"scenes": 2, **wish})
+    if key not in ("seed", "params", "scenes"):  # which a scene may have
+        with pytest.raises(SceneError, match=rf"^make\(1\).{key}: expected"):
+            RenderDataset(lambda _: (room(0), wish), 2)[1]
+
+
+@pytest.mark.parametrize(
+    "shard", [3, "ab", (0, 1, 2), (0,), (0.0, 2), (None, 2), (2, 2), (-1, 2), (0, 0), {"rank": 0, "world": 1}], ids=str
+)
+def test_shards_that_are_not_accepted(shard):
+    with pytest.raises(SceneError, match=r"^shard: expected \(rank, world\) with 0 <= rank < world, got ") as refused:
+        RenderStream(room, shard=shard)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("cameras", "says"),
+    [
+        (torch.eye(4), r"cameras: expected a sequence of poses .*, got \(4, 4\)"),
+        (np.eye(4), r"cameras: expected a sequence of poses .*, got \(4, 4\)"),
+        (torch.eye(4).tolist(), r"cameras: expected a sequence of poses .*, got \[\[1.0, 0.0"),
+        (list(torch.eye(4)), r"cameras: expected a sequence of poses .*, got \[tensor"),
+        (torch.tensor(1.0), r"cameras: expected a sequence of poses .*, got \(\)"),
+        (torch.eye(4)[None, None], r"cameras: expected a sequence of poses .*, got \(1, 1, 4, 4\)"),
+        ([torch.eye(4), torch.eye(3)], r"cameras\[1\]: expected a pose \(4, 4\) .*, got 'shape \(3, 3\)'"),
+    ],
+    ids=["tensor", "array", "list", "rows", "number", "nested", "shape"],
+)
+def test_cameras_that_are_not_accepted(cameras, says):
+    with pytest.raises(SceneError, match=f"^{says}") as refused:
+        RenderDataset(room, 1, cameras=cameras)
+    assert "\n" not in str(refused.value)
 
 
 def test_an_unknown_layer_is_named():
@@ -446,6 +486,8 @@ def test_ranks_share_a_stream(start):
     shares = [list(RenderStream(room, 12, start=start, shard=(rank, 3)).indices()) for rank in range(3)]
     assert sorted(index for share in shares for index in share) == list(range(start, 12))
     assert all(index % 3 == rank for rank, share in enumerate(shares) for index in share)
+    numbers: Any = (np.int64(1), torch.tensor(3))
+    assert list(RenderStream(room, 12, start=start, shard=numbers).indices()) == shares[1]
 
 
 def test_ranks_of_torch_distributed(tmp_path, monkeypatch):

@@ -114,7 +114,10 @@ REFUSED: dict[str, tuple[Callable[[torchpt.Scene], Any], str]] = {
     "cameras of a data set none": (lambda s: items(s, cameras=None), "cameras: expected a sequence of poses"),
     "cameras of a data set a word": (lambda s: items(s, cameras="x"), "cameras: expected a sequence of poses"),
     "a word for a pose": (lambda s: items(s, cameras=["x"]), r"cameras\[0\]: expected numbers"),
-    "one pose for many": (lambda s: items(s, cameras=torch.eye(4)), r"cameras\[0\]: expected a pose \(4, 4\)"),
+    "one pose for many": (
+        lambda s: items(s, cameras=torch.eye(4)),
+        r"cameras: expected a sequence of poses \(4, 4\) .*, got \(4, 4\)",
+    ),
     "a word for a parameter": (
         lambda s: items(s, cameras=[{"camera.fov": "wide"}])[0],
         "params.camera.fov: expected numbers",

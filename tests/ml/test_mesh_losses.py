@@ -119,6 +119,32 @@ def test_an_edge_of_three_faces_has_three_pairs() -> None:
     assert float(mesh_normal_consistency(vertices, faces)) == pytest.approx((1.0 + 1.0 + 0.0) / 3.0)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize("scale", [1.0, 1e-12, 1e12])
+@pytest.mark.parametrize("corner", [[2.0, 0, 0], [1.0, 0, 0], [0.3, 1e-17, 0], [0.3, 0, 1e-17]], ids=str)
+def test_a_face_without_area_is_perpendicular_and_has_no_gradient(
+    dtype: torch.dtype, scale: float, corner: list[float]
+) -> None:
+    """Of the two pairs one is in a plane, the other has a face whose corners are on a line, within rounding."""
+    points = [[0.0, 0, 0], [1, 0, 0], corner, [0, 1, 0], [-1, 1, 0]]
+    vertices = (scale * torch.tensor(points, dtype=dtype)).requires_grad_()
+    faces = torch.tensor([[0, 1, 2], [0, 1, 3], [0, 3, 4]])
+    loss = mesh_normal_consistency(vertices, faces)
+    (gradient,) = torch.autograd.grad(loss, vertices)
+    assert float(loss.detach()) == pytest.approx(0.5)
+    assert float(scale * gradient.abs().max()) < 10.0 and not bool(gradient[2].any())
+
+
+def test_the_consistency_of_normals_has_no_unit_of_length() -> None:
+    vertices, faces = bumpy()
+    expected = mesh_normal_consistency(vertices, faces)
+    for scale in (1e-15, 1e-4, 1e15):
+        torch.testing.assert_close(
+            mesh_normal_consistency(scale * vertices.float(), faces).double(), expected, rtol=1e-4, atol=0
+        )
+    assert bool(mesh_normal_consistency(vertices * torch.nan, faces).isnan())
+
+
 @pytest.mark.parametrize(
     "loss", [mesh_edge_loss, mesh_normal_consistency, mesh_laplacian_smoothing], ids=lambda loss: loss.__name__
 )
@@ -151,6 +177,35 @@ def test_meshes_that_are_refused(vertices: Any, faces: Any, error: type[Exceptio
         assert isinstance(refused.value, SceneError)
     with pytest.raises(ValueError, match="method: expected uniform or cot, got 'cotan'"):
         mesh_laplacian_smoothing(*TETRAHEDRON, method="cotan")
+
+
+@pytest.mark.parametrize(
+    ("length", "error"),
+    [
+        (None, TypeError),
+        ("x", TypeError),
+        (True, TypeError),
+        (torch.ones(6), TypeError),
+        (torch.nan, ValueError),
+        (torch.inf, ValueError),
+        (-1.0, ValueError),
+        (torch.tensor(torch.nan), ValueError),
+    ],
+    ids=str,
+)
+def test_lengths_that_are_refused(length: Any, error: type[Exception]) -> None:
+    with pytest.raises(error, match=r"^target_length: expected a finite number >= 0.*, got ") as refused:
+        mesh_edge_loss(*TETRAHEDRON, target_length=length)
+    assert isinstance(refused.value, SceneError) and "\n" not in str(refused.value)
+
+
+def test_a_length_may_be_a_tensor_of_one_number() -> None:
+    length = torch.tensor([1.0], requires_grad=True)
+    mesh_edge_loss(*OCTAHEDRON, target_length=length).backward()
+    assert float(length.grad) == pytest.approx(-2.0 * (math.sqrt(2.0) - 1.0))  # type: ignore[arg-type]
+    lengths = torch.tensor([0.0, 1.0])
+    found = torch.func.vmap(lambda length: mesh_edge_loss(*OCTAHEDRON, target_length=length))(lengths)
+    torch.testing.assert_close(found, (math.sqrt(2.0) - lengths).square())
 
 
 def test_a_scene_has_the_faces_of_its_meshes() -> None:

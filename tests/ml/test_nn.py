@@ -162,6 +162,13 @@ def test_values_are_assigned_and_written(scene):
         renderer.assign({LAMP: colour})
 
 
+@pytest.mark.parametrize("values", [None, torch.ones(3), [WALL]], ids=["none", "tensor", "names"])
+def test_what_is_assigned_is_a_mapping(renderer, values):
+    with pytest.raises(SceneError, match="^values: expected a mapping from names .*, got ") as refused:
+        renderer.assign(values)
+    assert "\n" not in str(refused.value)
+
+
 BEAM, CUTOFF, PLACE, AIM = (f"lights.s.{name}" for name in ("beam_width", "cutoff_angle", "position", "target"))
 
 

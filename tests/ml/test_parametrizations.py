@@ -320,6 +320,8 @@ def test_a_renderer_with_large_steps() -> None:
     optimizer.step()
     moved = own.params[name][:, 2] - renderer.values()[name].detach()[:, 2]
     assert float(moved[0]) > float(moved[2]) > float(moved[4]) > 0.0
+    with pytest.raises(SceneError, match=rf"^parametrizations.{name}.lambda_: expected at most .*, got 1e\+30"):
+        Renderer(own, name, parametrizations={name: LargeSteps(own.faces(name), 1e30)})
     renderer.assign({name: own.params[name] + 0.5})
     torch.testing.assert_close(renderer.values()[name].detach(), own.params[name] + 0.5)
     assert renderer().shape == (8, 8, 3)
@@ -348,9 +350,68 @@ def test_large_steps_of_too_few_vertices_and_what_print_says() -> None:
     assert repr(LargeSteps(STRIP, 4.5)) == "LargeSteps(lambda_=4.5, 9 edges)"
 
 
-def test_numbers_that_are_not_finite_are_an_error() -> None:
-    with pytest.raises(RuntimeError, match="did not converge: expected finite numbers"):
-        LargeSteps(STRIP)(torch.full((6, 3), torch.nan))
+@pytest.mark.parametrize(
+    ("x", "error", "says"),
+    [
+        (None, TypeError, r"^x: expected a floating tensor of vertices \(V, 3\) .* V at least 6, got 'NoneType'"),
+        (torch.zeros(6, 3, dtype=torch.int64), TypeError, "^x: expected a floating tensor .*, got 'torch.int64'"),
+        (torch.full((6, 3), torch.nan), ValueError, "^x: expected finite numbers, got nan"),
+        (torch.full((6, 3), torch.inf), ValueError, "^x: expected finite numbers, got inf"),
+    ],
+    ids=["none", "whole", "nan", "inf"],
+)
+def test_vertices_that_are_refused(x: Any, error: type[Exception], says: str) -> None:
+    with pytest.raises(error, match=says) as refused:
+        LargeSteps(STRIP)(x)
+    assert isinstance(refused.value, SceneError) and "\n" not in str(refused.value)
+    with pytest.raises(ValueError, match=r"^vertices \(V, 3\) of the mesh"):
+        LargeSteps(STRIP).inverse(None)  # type: ignore[arg-type]
+
+
+def test_gradients_of_vertices_that_are_not_finite_are_an_error() -> None:
+    x = drawn(6, 3).requires_grad_()
+    with pytest.raises(SceneError, match="^gradient of the solution of x: expected finite numbers, got nan"):
+        (LargeSteps(STRIP)(x) * torch.nan).sum().backward()
+
+
+def test_a_weight_beside_which_vertices_are_lost_in_rounding_is_refused() -> None:
+    """Of each dtype the largest one brings vertices back to a few parts of their size, or better."""
+    vertices = drawn(6, 3) + 3.0
+    for dtype, weight, error in ((torch.float32, 1.6e6, 0.5), (torch.float64, 1.9e9, 1e-4)):
+        steps, own = LargeSteps(STRIP, weight), vertices.to(dtype)
+        assert float((steps(steps.inverse(own)) - own).abs().max()) < error
+        for call in (
+            LargeSteps(STRIP, 2.0 * weight),
+            LargeSteps(STRIP, 2.0 * weight).inverse,
+            LargeSteps(STRIP, 1e308),
+        ):
+            with pytest.raises(
+                ValueError, match=f"^lambda_: expected at most .* for this mesh in {dtype}, got "
+            ) as refused:
+                call(own)
+            assert isinstance(refused.value, SceneError)
+    assert torch.equal(LargeSteps(STRIP[:0], 1e30)(vertices), vertices)  # without an edge there is nothing to round
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit.script` is:DeprecationWarning")  # of torch's own jvp, at its first call
+def test_large_steps_under_transforms() -> None:
+    steps, matrix, batch = LargeSteps(STRIP, 5.0), dense(STRIP, 7, 5.0), drawn(4, 7, 3)
+    right = torch.linalg.solve(matrix, batch)
+    torch.testing.assert_close(torch.func.vmap(steps)(batch), right)
+    torch.testing.assert_close(
+        torch.func.vmap(steps, in_dims=2, out_dims=1)(batch.permute(1, 2, 0)), right.movedim(0, 1)
+    )
+    nested = torch.func.vmap(torch.func.vmap(steps))(batch.reshape(2, 2, 7, 3))
+    torch.testing.assert_close(nested, right.reshape(2, 2, 7, 3))
+    torch.testing.assert_close(torch.func.vmap(steps.inverse)(right), batch)
+    torch.testing.assert_close(torch.func.jvp(steps, (batch[0],), (batch[1],))[1], right[1])
+    jacobian = torch.einsum("ab,cd->acbd", torch.linalg.inv(matrix), torch.eye(3).double())
+    torch.testing.assert_close(torch.func.jacrev(steps)(batch[0]), jacobian)
+    torch.testing.assert_close(torch.func.jacfwd(steps)(batch[0]), jacobian)
+    hessian = torch.func.hessian(lambda x: steps(x).square().sum())(batch[0])
+    torch.testing.assert_close(hessian, 2.0 * torch.einsum("abcd,abef->cdef", jacobian, jacobian))
+    with pytest.raises(SceneError, match="^x: expected finite numbers, got nan"):
+        torch.func.vmap(steps)(torch.full_like(batch, torch.nan))
 
 
 # ---- Adam with one scale
@@ -396,10 +457,47 @@ def test_its_state_is_saved() -> None:
     assert torch.equal(later, whole)
 
 
-@pytest.mark.parametrize("wrong", [{"lr": -1.0}, {"betas": (0.9, 1.0)}, {"eps": -1.0}])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"lr": -1.0},
+        {"lr": None},
+        {"lr": "x"},
+        {"lr": torch.nan},
+        {"lr": torch.ones(2)},
+        {"betas": (0.9, 1.0)},
+        {"betas": (0.9, 0.99, 0.999)},
+        {"betas": (0.9, None)},
+        {"betas": 0.9},
+        {"betas": None},
+        {"betas": "ab"},
+        {"betas": torch.tensor(0.9)},
+        {"eps": -1.0},
+        {"eps": None},
+    ],
+    ids=str,
+)
 def test_settings_of_the_optimizer_that_are_refused(wrong: Any) -> None:
-    with pytest.raises(ValueError, match=f"expected {next(iter(wrong))}"):
-        AdamUniform([torch.zeros(1, requires_grad=True)], **wrong)
+    x, other = (torch.zeros(1, requires_grad=True) for _ in range(2))
+    optimizer = AdamUniform([x])
+    for call in (
+        lambda: AdamUniform([x], **wrong),
+        lambda: AdamUniform([{"params": [x], **wrong}]),
+        lambda: optimizer.add_param_group({"params": [other], **wrong}),
+    ):
+        with pytest.raises(ValueError, match=f"^{next(iter(wrong))}: expected ") as refused:
+            call()
+        assert "\n" not in str(refused.value)
+    assert len(optimizer.param_groups) == 1
+
+
+def test_groups_have_settings_of_their_own_and_empty_tensors_are_left_out() -> None:
+    first, other, empty = (torch.zeros(n, requires_grad=True) for n in (1, 1, 0))
+    optimizer = AdamUniform([{"params": [first, empty]}, {"params": [other], "lr": 0.2, "betas": [0.5, 0.9]}], lr=0.1)
+    for x in (first, other, empty):
+        x.grad = torch.ones_like(x)
+    optimizer.step()
+    assert (float(first.detach()), float(other.detach())) == pytest.approx((-0.1, -0.2))
 
 
 # ---- A shape from pictures

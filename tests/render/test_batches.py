@@ -646,6 +646,11 @@ def test_poses_as_nested_lists():
         ({"spp": [1, 0]}, r"^scenes\[1\]\.render\.spp: "),
         ({"spp": [1, "a"]}, "^spp: "),
         ({"spp": 2.5}, "^spp: expected a whole number"),
+        ({"spp": torch.tensor([1.0, 2.0])}, r"^spp: expected a whole number.*, got \(\(2,\), torch.float32\)"),
+        ({"spp": torch.tensor(2.0)}, r"^spp: expected a whole number.*, got \(\(\), torch.float32\)"),
+        ({"spp": torch.tensor([True, True])}, "^spp: expected a whole number.*torch.bool"),
+        ({"spp": np.array([1.0, 2.0])}, "^spp: expected a whole number.*dtype.'float64'"),
+        ({"seed": torch.tensor([1.0, 2.0])}, "^seed: expected a whole number.*torch.float32"),
         ({"cameras": torch.eye(4).expand(3, 1, 4, 4)}, "^cameras: expected as many as there are scenes, 2, got 3"),
         ({"cameras": torch.eye(4).expand(2, 0, 4, 4)}, r"^cameras: .*\(S, C, 4, 4\)"),
         (

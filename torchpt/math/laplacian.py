@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
-__all__ = ["LaplacianSystem", "adjacent_faces", "cotangent_weights", "mesh_edges", "neighbour_sums"]
+from torchpt.core.errors import ArgumentValueError
+
+__all__ = ["TOLERANCE", "LaplacianSystem", "adjacent_faces", "cotangent_weights", "mesh_edges", "neighbour_sums"]
 
 #: Largest residual of a solution, relative to the right side.
 TOLERANCE = 1e-10
@@ -141,18 +144,24 @@ class LaplacianSystem:
         degrees = self.degrees.to(x)[:, None]
         return x + self.weight * (degrees * x - neighbour_sums(self.edges, x))
 
-    def solve(self, b: Tensor) -> Tensor:
-        """Return ``(I + λ L)^-1 b`` of ``b (V, C)``, in the dtype of ``b``, computed in float64; differentiable.
+    def solve(self, b: Tensor, key: str) -> Tensor:
+        """Return ``(I + λ L)^-1 b`` of ``b (V, C)``, in the dtype of ``b``, computed in float64; ``key``: its name in errors.
+
+        Derivatives of both modes and of all orders, and ``vmap``, go through it.
 
         Raises:
-            RuntimeError: ``b`` is not finite.
+            SceneError: ``b`` is not finite; also a ``ValueError``.
+            RuntimeError: λ is so large that the solution is lost in rounding.
         """
-        solution = _Solve.apply(self, b)
+        solution = _Solve.apply(self, b, key)
         assert isinstance(solution, Tensor)
         return solution
 
-    def _conjugate_gradients(self, b: Tensor) -> Tensor:
+    def _conjugate_gradients(self, b: Tensor, key: str) -> Tensor:
         """Solve by conjugate gradients with the diagonal as preconditioner, each column on its own."""
+        finite = torch.isfinite(b)
+        if not bool(finite.all()):
+            raise ArgumentValueError(key, float(b[~finite][0]), "finite numbers")
         b64 = b.double()
         inverse_diagonal = 1.0 / (1.0 + self.weight * self.degrees)[:, None]
         x = torch.zeros_like(b64)
@@ -171,20 +180,32 @@ class LaplacianSystem:
             z = inverse_diagonal * residual
             before, rz = rz, (residual * z).sum(0)
             direction = z + torch.where(before > 0, rz / before, 0.0) * direction
-        raise RuntimeError("conjugate gradients did not converge: expected finite numbers on the right side")
+        raise RuntimeError(
+            f"conjugate gradients did not converge for {len(b)} vertices and a weight of {self.weight:g}"
+        )
 
 
 class _Solve(torch.autograd.Function):
-    """``(I + λ L)^-1 b``; as the matrix is symmetric, its derivative is the same solve."""
+    """``(I + λ L)^-1 b``: linear, so its derivative is the same solve, in both modes as the matrix is symmetric."""
 
     @staticmethod
-    def forward(system: LaplacianSystem, b: Tensor) -> Tensor:
-        return system._conjugate_gradients(b)
+    def forward(system: LaplacianSystem, b: Tensor, key: str) -> Tensor:
+        return system._conjugate_gradients(b, key)
 
     @staticmethod
-    def setup_context(ctx: object, inputs: tuple[LaplacianSystem, Tensor], output: Tensor) -> None:
-        ctx.system = inputs[0]  # pyright: ignore[reportAttributeAccessIssue]
+    def setup_context(ctx: Any, inputs: tuple[LaplacianSystem, Tensor, str], output: Tensor) -> None:
+        ctx.system, _, ctx.key = inputs
 
     @staticmethod
-    def backward(ctx: object, *cotangents: Tensor) -> tuple[None, Tensor]:
-        return None, ctx.system.solve(cotangents[0])  # pyright: ignore[reportAttributeAccessIssue]
+    def backward(ctx: Any, *cotangents: Tensor) -> tuple[None, Tensor, None]:
+        return None, ctx.system.solve(cotangents[0], f"gradient of the solution of {ctx.key}"), None
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:
+        return ctx.system.solve(tangents[1], f"tangent of {ctx.key}")
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[Tensor, int]:
+        system, b, key = args
+        columns = b.movedim(in_dims[1], -1)  # (V, C, B)
+        return system.solve(columns.flatten(1), key).reshape(columns.shape), 2

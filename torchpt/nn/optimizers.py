@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import math
+from collections.abc import Callable, Iterable, Sequence
+from numbers import Real
 from typing import Any
 
 import torch
 from torch import Tensor
+
+from torchpt.core.errors import ArgumentValueError
 
 __all__ = ["AdamUniform"]
 
@@ -24,7 +28,7 @@ class AdamUniform(torch.optim.Optimizer):
         eps: added to the divisor.
 
     Raises:
-        ValueError: an argument out of range.
+        ValueError: an argument, or a setting of a group, that is out of range or of another type.
     """
 
     def __init__(
@@ -34,13 +38,19 @@ class AdamUniform(torch.optim.Optimizer):
         betas: tuple[float, float] = (0.9, 0.999),
         eps: float = 1e-8,
     ) -> None:
-        if not 0.0 <= lr < float("inf"):
-            raise ValueError(f"expected lr >= 0, got {lr}")
-        if not all(0.0 <= beta < 1.0 for beta in betas):
-            raise ValueError(f"expected betas in 0..1 without 1, got {betas}")
-        if not 0.0 <= eps < float("inf"):
-            raise ValueError(f"expected eps >= 0, got {eps}")
-        super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
+        defaults = {"lr": lr, "betas": betas, "eps": eps}
+        _check(defaults)
+        super().__init__(params, defaults)
+
+    def add_param_group(self, param_group: dict[str, Any]) -> None:
+        """Add a group of tensors with settings of their own, as for all optimizers of torch.
+
+        Raises:
+            ValueError: a setting is out of range or of another type.
+        """
+        if isinstance(param_group, dict):  # torch refuses others
+            _check({**self.defaults, **param_group})
+        super().add_param_group(param_group)
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
@@ -52,7 +62,7 @@ class AdamUniform(torch.optim.Optimizer):
         for group in self.param_groups:
             beta1, beta2 = group["betas"]
             for value in group["params"]:
-                if value.grad is None:
+                if value.grad is None or not value.numel():
                     continue
                 state = self.state[value]
                 if not state:
@@ -65,3 +75,21 @@ class AdamUniform(torch.optim.Optimizer):
                 square = state["square"] / (1.0 - beta2 ** state["step"])
                 value.sub_(group["lr"] * mean / (square.max().sqrt() + group["eps"]))
         return loss
+
+
+def _check(settings: dict[str, Any]) -> None:
+    """Raise ArgumentValueError unless the settings of a group are in their ranges."""
+    for key in ("lr", "eps"):
+        if not 0.0 <= _number(settings[key]) < math.inf:
+            raise ArgumentValueError(key, settings[key], "a finite number >= 0")
+    betas = settings["betas"]
+    is_row = betas.dim() == 1 if isinstance(betas, Tensor) else isinstance(betas, Sequence)
+    if not is_row or len(betas) != 2 or not all(0.0 <= _number(beta) < 1.0 for beta in betas):
+        raise ArgumentValueError("betas", betas, "two numbers in 0..1 without 1")
+
+
+def _number(value: Any) -> float:
+    """Return a number, also of a tensor of one; nan where it is none."""
+    if isinstance(value, Tensor) and value.numel() == 1 and not value.is_complex():
+        return float(value.detach())
+    return float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan

@@ -31,7 +31,7 @@ import torch
 from torch import Tensor, nn
 
 from torchpt.core.errors import ArgumentTypeError, ArgumentValueError
-from torchpt.math.laplacian import LaplacianSystem, mesh_edges
+from torchpt.math.laplacian import TOLERANCE, LaplacianSystem, mesh_edges
 from torchpt.nn.poses import PARALLEL, axis_angle_matrix, look_at_matrix, pose_of, quaternion_matrix
 from torchpt.spec import Pose, Spec
 
@@ -317,11 +317,13 @@ class LargeSteps(Parametrization):
     """Vertices ``v (V, 3)`` of a mesh as ``(I + λ L)^-1 x``, so that steps of an optimizer move smooth regions together.
 
     Nicolet, Jacobson and Jakob, *Large Steps in Inverse Rendering of Geometry* (2021): L is the combinatorial Laplacian. A
-    gradient step in ``x`` is one in ``v`` smoothed twice, so meshes stay free of tangles at large learning rates.
+    gradient step in ``x`` is one in ``v`` smoothed twice, so meshes stay free of tangles at large learning rates. ``backward``,
+    the transforms of ``torch.func`` (``vmap`` and ``jvp`` too) and derivatives of any order go through both directions.
 
     Args:
         faces: ``(F, 3)`` indices of vertices, such as ``scene.faces("shapes.NAME")``.
-        lambda_: weight λ of smoothness, from 0; the paper takes 19 for most meshes, more for finer ones.
+        lambda_: weight λ of smoothness, from 0; the paper takes 19 for most meshes, more for finer ones. In float32 a million
+            is about the most: of larger ones ``I`` is lost in rounding beside ``λ L``.
 
     Raises:
         SceneError: faces are no tensor ``(F, 3)`` of indices, or λ is no number from 0; also a ``TypeError`` or ``ValueError``.
@@ -350,30 +352,44 @@ class LargeSteps(Parametrization):
         self.lambda_ = float(lambda_)
         self.register_buffer("edges", mesh_edges(faces), persistent=False)
         self.vertex_count = int(faces.max()) + 1 if faces.numel() else 0  # at least
+        self.most_neighbours = int(torch.bincount(self.edges.reshape(-1)).max()) if len(self.edges) else 0
         self._system: LaplacianSystem | None = None
 
     def forward(self, x: Tensor) -> Tensor:
         """See :class:`Parametrization`.
 
         Raises:
-            SceneError: not as many numbers as the mesh has; also a ``ValueError``.
+            SceneError: no floating tensor, also a ``TypeError``; not as many numbers as the mesh has, numbers that are not
+                finite, or a weight λ that is too large for their dtype, also a ``ValueError``.
         """
+        if not isinstance(x, Tensor) or not x.is_floating_point():
+            found = str(x.dtype) if isinstance(x, Tensor) else type(x).__name__
+            raise ArgumentTypeError("x", found, f"a floating tensor of {self._expected()}")
         if not self._fits(x):
             raise ArgumentValueError("x", tuple(x.shape), self._expected())
-        return self._system_of(x).solve(x)
+        self._check_weight(x.dtype)
+        return self._system_of(x).solve(x, "x")
 
     def inverse(self, value: Tensor) -> Tensor:
         """See :class:`Parametrization`.
 
         Raises:
-            ValueError: the value is not of vertices of these faces.
+            ValueError: the value is not of vertices of these faces, or the weight λ too large for its dtype.
         """
-        if not self._fits(value):
+        if not isinstance(value, Tensor) or not value.is_floating_point() or not self._fits(value):
             raise ValueError(self._expected())
+        self._check_weight(value.dtype)
         return self._system_of(value).apply(value.double()).to(value)
 
     def _fits(self, vertices: Tensor) -> bool:
         return vertices.dim() == 2 and vertices.shape[1] == 3 and len(vertices) >= self.vertex_count
+
+    def _check_weight(self, dtype: torch.dtype) -> None:
+        """Raise ArgumentValueError if rounding of ``λ L v``, in a dtype and by the solver, is as large as ``v``."""
+        rounding = max(torch.finfo(dtype).eps, TOLERANCE) * self.most_neighbours
+        if self.lambda_ * rounding > 1.0:
+            expected = f"at most {1.0 / rounding:.2g} for this mesh in {dtype}"
+            raise ArgumentValueError("lambda_", self.lambda_, expected)
 
     def _expected(self) -> str:
         return f"vertices (V, 3) of the mesh whose faces LargeSteps was given, V at least {self.vertex_count}"

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from torchpt.core.autograd import outside_transforms, transforms_are_active
-from torchpt.core.errors import SceneError
+from torchpt.core.errors import ArgumentValueError, SceneError
 from torchpt.nn.parametrizations import Parametrization, PoseParametrization, parametrization_of
 from torchpt.rendering.api import render
 from torchpt.rendering.requests import check_options
@@ -151,8 +151,10 @@ class Renderer(nn.Module):
         """Set parameters to values by dotted name, tensors or as in scene files: all of them, or none if one is refused.
 
         Raises:
-            SceneError: a name is no parameter of this module, or the scene does not accept the values.
+            SceneError: no mapping, a name that is no parameter of this module, or values that the scene does not accept.
         """
+        if not isinstance(values, Mapping):
+            raise SceneError("values", values, "a mapping from names of the module's parameters to values")
         for name in values:
             if name not in self.names:
                 raise SceneError(f"params.{name}", name, f"one of {', '.join(self.names)}")
@@ -250,6 +252,8 @@ def _inverse(name: str, parametrization: Parametrization, value: Tensor) -> Tens
     """
     try:
         return parametrization.inverse(value)
+    except ArgumentValueError as error:  # of an argument of the parametrization
+        raise SceneError(f"parametrizations.{name}.{error.key}", error.value, error.expected) from None
     except ValueError as error:
         shown = value.tolist() if value.numel() <= 16 else tuple(value.shape)
         raise SceneError(f"params.{name}", shown, str(error)) from None

@@ -227,8 +227,11 @@ def values_of(key: str, given: Any, scenes: int | None, cameras: int) -> Callabl
         cameras: number of cameras.
 
     Raises:
-        SceneError: too few or too many values.
+        SceneError: a tensor or an array of other than whole numbers, too few or too many values.
     """
+    if isinstance(given, Tensor | np.ndarray) and not _is_whole(given):
+        found = (tuple(given.shape), given.dtype)
+        raise SceneError(key, found, "a whole number, or several of them: tensors and arrays of an integer type")
     nested = given.tolist() if isinstance(given, Tensor | np.ndarray) else given
     if nested is None or isinstance(nested, int | SceneValue):
         return lambda s, c: nested
@@ -246,6 +249,13 @@ def values_of(key: str, given: Any, scenes: int | None, cameras: int) -> Callabl
         return row[c] if isinstance(row, Sequence) else row
 
     return value_of
+
+
+def _is_whole(numbers: Tensor | np.ndarray) -> bool:
+    """Return True for a tensor or an array of an integer type; bool is none."""
+    if isinstance(numbers, np.ndarray):
+        return numbers.dtype.kind in "iuO"  # O: integers of Python
+    return not (numbers.is_floating_point() or numbers.is_complex() or numbers.dtype == torch.bool)
 
 
 def number_of(given: Any) -> int | None:
