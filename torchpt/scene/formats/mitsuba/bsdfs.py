@@ -18,7 +18,7 @@ from torchpt.scene.formats.mitsuba.textures import scaled
 if TYPE_CHECKING:
     from torchpt.scene.formats.mitsuba.importer import Importer
 
-__all__ = ["BSDFS", "UNKNOWN"]
+__all__ = ["BSDFS", "UNKNOWN", "opacity_of"]
 
 Material = dict[str, Any]
 
@@ -263,6 +263,23 @@ def _passes(material: Material) -> bool:
     return kind in ("dielectric", "thindielectric", "roughdielectric", "null") or (
         kind == "principled" and material.get("spec_trans", 0.0) != 0.0
     )
+
+
+def opacity_of(material: Material) -> float | None:
+    """Return the share of light that a material does not let straight through; None where a texture gives it."""
+    found = material.get("opacity", 1.0)
+    if material["type"] == "null":
+        found = 0.0
+    elif material["type"] == "blend":
+        a, b, weight = opacity_of(material["a"]), opacity_of(material["b"]), material["weight"]
+        if a == b == 1.0:
+            inner = 1.0
+        elif a is None or b is None or isinstance(weight, dict):
+            return None
+        else:
+            inner = a + (b - a) * weight
+        return None if isinstance(found, dict) else found * inner
+    return None if isinstance(found, dict) else float(found)
 
 
 def _mixture(p: Properties, importer: Importer) -> Material:

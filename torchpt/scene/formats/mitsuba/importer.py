@@ -14,7 +14,7 @@ import numpy as np
 from torchpt.core.errors import AssetError, SceneError, did_you_mean
 from torchpt.core.files import is_regular
 from torchpt.math.transforms import is_usable
-from torchpt.scene.formats.mitsuba.bsdfs import BSDFS, UNKNOWN
+from torchpt.scene.formats.mitsuba.bsdfs import BSDFS, UNKNOWN, opacity_of
 from torchpt.scene.formats.mitsuba.elements import Element, parse_scene, walk
 from torchpt.scene.formats.mitsuba.emitters import EMITTERS, join_skies
 from torchpt.scene.formats.mitsuba.notes import Notes
@@ -31,7 +31,7 @@ from torchpt.scene.formats.mitsuba.sensors import (
     UNKNOWN_SAMPLER,
 )
 from torchpt.scene.formats.mitsuba.shapes import SHAPES, bounds, posed, with_attribute
-from torchpt.scene.formats.mitsuba.textures import TEXTURES, attributes_of
+from torchpt.scene.formats.mitsuba.textures import TEXTURES, attributes_of, scaled
 from torchpt.scene.formats.mitsuba.versions import plugin_name
 
 __all__ = ["PLUGINS", "ImportOptions", "Importer", "read_mitsuba", "split_import_keys"]
@@ -168,6 +168,7 @@ class Importer:
         self._depth = 0
         self._folders = [base]
         self._ids: dict[str, Element] = {}
+        self._keys: dict[str, str] = {}  # key of a material or a texture, by its id
         self._find_ids()
         if left_out:
             self._leave_out(left_out)
@@ -279,20 +280,26 @@ class Importer:
         """Return the material of a ``<bsdf>``."""
         if element.tag != "bsdf":
             raise element.error(f"<{element.written}>", "a bsdf")
-        if element.id and _key(element.id) in self.materials:
-            return self.materials[_key(element.id)]
+        if self._keys.get(element.id) in self.materials:
+            return self.materials[self._keys[element.id]]
         return self.build(BSDFS, element, UNKNOWN)
 
     def texture(self, element: Element) -> Any:
         """Return a texture for a parameter: a reference to a named one, one in place, or a colour."""
-        name = _key(element.id)
-        if element.id and name in self.textures:
-            return {"texture": name}
+        if self._keys.get(element.id) in self.textures:
+            return {"texture": self._keys[element.id]}
         value = self.build(TEXTURES, element, _UNKNOWN_TEXTURE)
         if not element.id or not isinstance(value, dict) or "texture" in value:
             return value
+        name = self._key(self.textures, element)
         self.textures[name] = value
         return {"texture": name}
+
+    def _key(self, taken: Mapping[str, Any], element: Element) -> str:
+        """Return the key of a material or a texture that has an id; ids that make the same key get one each."""
+        if element.id not in self._keys:
+            self._keys[element.id] = self._free(taken, element)
+        return self._keys[element.id]
 
     # ---- The scene
 
@@ -415,7 +422,7 @@ class Importer:
         border = has_medium and emitter is None and element.version < (2,)
         material, name = self._material_of(inner.get("bsdf"), lit=emitter is not None, border=border)
         if emitter is not None:
-            radiance = self._radiance(emitter)
+            radiance = self._radiance(emitter, opacity_of(material))
             if isinstance(radiance, dict):
                 material, name = {**material, "emission": radiance}, None
             elif radiance is not None:
@@ -455,12 +462,17 @@ class Importer:
         material = self.material(element)
         if not element.id:
             return material, None
-        name = _key(element.id)
+        name = self._key(self.materials, element)
         self.materials[name] = material
         return material, name
 
-    def _radiance(self, element: Element) -> Any:
-        """Return the radiance of an area emitter: a colour or a texture; None where the emitter is left out."""
+    def _radiance(self, element: Element, opacity: float | None) -> Any:
+        """Return the radiance of an area emitter: a colour or a texture; None where the emitter is left out.
+
+        Args:
+            element: the emitter.
+            opacity: that of its shape, which Mitsuba's emission does not depend on and ours is multiplied by; None: a texture.
+        """
         name = plugin_name(element.tag, element.type)
         if name != "area":
             self.notes.add(element, f"{element.label} on a shape is left out: only area emitters are on shapes")
@@ -469,6 +481,12 @@ class Importer:
         properties.ignore("sampling_weight")
         found = properties.slot("radiance", [1.0] * 3, light=True)
         properties.left_over()
+        if opacity is None:
+            properties.note("emission is multiplied by the opacity of the shape, a texture, where Mitsuba's is not")
+        elif not opacity > 0.0:
+            properties.note("it is left out: its shape is not there (null, or an opacity of 0), where Mitsuba's shines")
+        elif opacity != 1.0:
+            found = scaled(found, [1.0 / opacity] * 3, properties)
         return found
 
     def _instance(self, element: Element) -> None:
@@ -529,7 +547,7 @@ class Importer:
 
     def _free(self, taken: Mapping[str, Any], element: Element, kind: str = "") -> str:
         """Return a name that is not taken: the id of an element, else its type and a number."""
-        stem = _key(element.id) if element.id else kind or element.type
+        stem = _as_key(element.id) if element.id else kind or element.type
         if element.id and stem not in taken:
             return stem
         number = len(taken) + 1
@@ -541,7 +559,7 @@ class Importer:
 _ENVIRONMENTS = ("envmap", "constant", "sky")
 
 
-def _key(name: str) -> str:
+def _as_key(name: str) -> str:
     """Return an id as a key of a scene file."""
     found = "".join(letter if letter.isprintable() else "_" for letter in name).strip()[:200]
     return found or "_"
