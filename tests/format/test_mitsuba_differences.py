@@ -76,3 +76,42 @@ def test_emission_does_not_depend_on_opacity(tmp_path: Path, bsdf: str, radiance
     found, said = opened(tmp_path, sphere(f'{bsdf}<emitter type="area"><rgb name="radiance" value="2"/></emitter>'))
     assert found["shapes"]["sphere_1"]["emission"] == pytest.approx([radiance] * 3)
     assert len(said) == bool(words) and words in "".join(said)
+
+
+@pytest.mark.parametrize(
+    ("inner", "words"),
+    [
+        ('<transform name="to_world"><scale x="2" v="3"/></transform>', "scale: the attribute v is unknown"),
+        (
+            '<transform name="to_world"><lookat origin="0,0,0" target="1,0,0" upp="0,1,0"/></transform>',
+            "lookat: the attribute upp",
+        ),
+        ('<transform name="to_world" foo="1"/>', "transform to_world: the attribute foo is unknown"),
+        ('<float name="radius" value="2" vaule="3"/>', "float radius: the attribute vaule is unknown"),
+        (
+            '<float name="radius" value="2"><float name="a" value="1"/></float>',
+            "float radius: the float inside is left out",
+        ),
+        ('<bsdf type="diffuse" foo="1"/>', 'bsdf "diffuse": the attribute foo is unknown'),
+        ('<ref id="grey" foo="1"/>', "ref: the attribute foo is unknown"),
+        ('<spectrum name="wish" value="1" intent="x" unit="1"/>', "spectrum wish: the attribute unit is unknown"),
+    ],
+)
+def test_attributes_that_nobody_reads_are_named(tmp_path: Path, inner: str, words: str) -> None:
+    found, said = opened(tmp_path, scene(f'<bsdf type="diffuse" id="grey"/>\n<shape type="sphere">\n{inner}\n</shape>'))
+    assert len(found["shapes"]) == 1
+    line = scene("").count("\n") + 2
+    assert any(text.startswith(f"{line}: {words}") for text in said), said
+
+
+@pytest.mark.parametrize(
+    ("operation", "words"),
+    [
+        ('<rotate x="1"/>', "expected an attribute angle, got '<rotate>'"),
+        ('<rotate x="1" angel="30"/>', "expected an attribute angle, got '<rotate>'"),
+        ('<scale v=".2"/>', "expected x, y, z or value, got '<scale>'"),
+        ('<translate foo="1"/>', "expected x, y, z or value, got '<translate>'"),
+    ],
+)
+def test_operations_that_say_nothing_are_refused(tmp_path: Path, operation: str, words: str) -> None:
+    assert words in refused(tmp_path, sphere(f'<transform name="to_world">{operation}</transform>'))

@@ -19,7 +19,7 @@ from torchpt.scene.formats.mitsuba.elements import Element, parse_scene, walk
 from torchpt.scene.formats.mitsuba.emitters import EMITTERS, join_skies
 from torchpt.scene.formats.mitsuba.notes import Notes
 from torchpt.scene.formats.mitsuba.plugins import Plugin, Twin, left_out, nearest
-from torchpt.scene.formats.mitsuba.properties import OBJECTS, VALUES, Properties
+from torchpt.scene.formats.mitsuba.properties import OBJECTS, VALUES, Properties, note_unknown_parts
 from torchpt.scene.formats.mitsuba.sensors import (
     FILMS,
     FILTERS,
@@ -170,6 +170,7 @@ class Importer:
         self._ids: dict[str, Element] = {}
         self._keys: dict[str, str] = {}  # key of a material or a texture, by its id
         self._find_ids()
+        note_unknown_parts(root, self.notes)
         if left_out:
             self._leave_out(left_out)
 

@@ -8,15 +8,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchpt.core.errors import did_you_mean
 from torchpt.math.vectors import luminance
 from torchpt.scene.formats.mitsuba import values
-from torchpt.scene.formats.mitsuba.elements import Element
+from torchpt.scene.formats.mitsuba.elements import Element, walk
+from torchpt.scene.formats.mitsuba.notes import Notes
 from torchpt.scene.formats.mitsuba.versions import property_name
 
 if TYPE_CHECKING:
     from torchpt.scene.formats.mitsuba.importer import Importer
 
-__all__ = ["OBJECTS", "VALUES", "Properties"]
+__all__ = ["OBJECTS", "VALUES", "Properties", "note_unknown_parts"]
 
 #: Tags of objects, which have a plugin; all other tags are values.
 OBJECTS = (
@@ -25,6 +27,61 @@ OBJECTS = (
 )  # fmt: skip
 _COLOURS = ("rgb", "srgb", "spectrum", "blackbody", "color", "float", "integer")
 VALUES = (*_COLOURS, "boolean", "string", "point", "vector", "transform", "animation")
+
+_POINT = ("x", "y", "z", "value")
+_SPECTRUM = (
+    "type",
+    "value",
+    "values",
+    "wavelengths",
+    "wavelength_min",
+    "wavelength_max",
+    "filename",
+    "color",
+    "scale",
+    "intent",
+)
+#: Attributes by tag, without ``name``, which every value may have.
+_ATTRIBUTES: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(OBJECTS, ("type", "id")),
+    **dict.fromkeys((*_COLOURS, "boolean", "string"), ("value", "intent")),
+    **dict.fromkeys(("point", "vector"), _POINT),
+    "spectrum": (*_SPECTRUM, "temperature", "multiplier"),
+    "blackbody": ("temperature", "scale", "multiplier"),
+    "transform": ("time",),
+    "animation": (),
+    "ref": ("id",),
+}
+_OPERATIONS: dict[str, tuple[str, ...]] = {
+    "translate": _POINT,
+    "scale": _POINT,
+    "rotate": (*_POINT, "angle"),
+    "matrix": ("value",),
+    "lookat": ("origin", "target", "up", *(letter + axis for letter in "otu" for axis in "xyz")),
+}
+#: Values with elements inside.
+_CONTAINERS = ("transform", "animation", "spectrum", "blackbody")
+
+
+def note_unknown_parts(root: Element, notes: Notes) -> None:
+    """Warn of attributes that nobody reads and of elements inside plain values, which have none."""
+    for element in walk(root):
+        if element.tag in _OPERATIONS:
+            known = _OPERATIONS[element.tag]
+        elif element.tag in _ATTRIBUTES:
+            known = (*_ATTRIBUTES[element.tag], "name")
+        else:
+            continue
+        name = element.attributes.get("name", "") if element.tag in VALUES else ""
+        place = f"{element.label} {name}".rstrip()
+        for key in element.attributes:
+            if key not in known:
+                notes.add(
+                    element, f"{place}: the attribute {key} is unknown here and left out{did_you_mean(key, known)}"
+                )
+        if element.tag not in OBJECTS and element.tag not in _CONTAINERS:
+            for child in element.children:
+                notes.add(child, f"{place}: the {child.label} inside is left out")
 
 
 class Properties:

@@ -261,21 +261,31 @@ def _operation(element: Element) -> Matrix:
 
 
 def _translate(element: Element) -> Matrix:
+    _check_given(element)
     total = np.eye(4)
     total[:3, 3] = vector(element)
     return total
 
 
 def _scale(element: Element) -> Matrix:
+    _check_given(element)
     return np.diag([*vector(element, default=1.0), 1.0])
+
+
+def _check_given(element: Element) -> None:
+    """Refuse an operation none of whose attributes is one that it has; without any it does nothing, as in Mitsuba."""
+    if element.attributes and not any(key in element.attributes for key in ("value", *"xyz")):
+        raise element.error(f"<{element.written}>", "x, y, z or value")
 
 
 def _rotate(element: Element) -> Matrix:
     attributes = element.attributes
+    if "angle" not in attributes:
+        raise element.error("<rotate>", "an attribute angle")
     axis = vector(element)
     if not any(key in attributes for key in ("value", *"xyz")):
         axis = [0.0, 0.0, 1.0]
-    return transforms.rotate({"axis": axis, "angle": number(element, attributes.get("angle", "0"))})
+    return transforms.rotate({"axis": axis, "angle": number(element, attributes["angle"])})
 
 
 def _matrix(element: Element) -> Matrix:
