@@ -115,3 +115,36 @@ def test_attributes_that_nobody_reads_are_named(tmp_path: Path, inner: str, word
 )
 def test_operations_that_say_nothing_are_refused(tmp_path: Path, operation: str, words: str) -> None:
     assert words in refused(tmp_path, sphere(f'<transform name="to_world">{operation}</transform>'))
+
+
+@pytest.mark.parametrize(
+    ("pairs", "light", "reflectance"),
+    [
+        ("580:1, 590:1", [0.175672, 0.054318, 0.0], [0.163534, 0.0508251, 0.0]),
+        ("589:1, 590:1", [0.018754, 0.00392519, 0.0], None),
+        ("580:30, 581:30", [0.437132, 0.193018, 0.0], None),
+        ("580.2:1, 580.7:1", [0.00734447, 0.00318359, 0.0], None),
+        ("580:1, 590:1, 600:2", [0.517664, 0.0933608, 0.0], None),
+        ("560:.9, 570:.9", None, [0.0579107, 0.0966161, 0.0]),
+    ],
+)
+def test_spectra_that_end_where_they_are_seen_are_summed_up_as_in_mitsuba(
+    tmp_path: Path, pairs: str, light: list[float] | None, reflectance: list[float] | None
+) -> None:
+    """The numbers are those of Mitsuba 3.9.1, ``scalar_rgb``, whose D65 makes a flat reflectance 0.99889."""
+    value = f'<spectrum name="{{}}" value="{pairs}"/>'
+    if light:
+        found, _ = opened(tmp_path, scene(f'<emitter type="constant">{value.format("radiance")}</emitter>'))
+        assert found["lights"]["constant_1"]["radiance"] == pytest.approx(light, rel=1e-5)
+    if reflectance:
+        found, _ = opened(tmp_path, sphere(f'<bsdf type="diffuse">{value.format("reflectance")}</bsdf>'))
+        mine = found["shapes"]["sphere_1"]["material"]["reflectance"]
+        assert [0.99889 * part for part in mine] == pytest.approx(reflectance, rel=1e-4)
+
+
+def test_a_colour_in_place_of_a_number_is_its_mean(tmp_path: Path) -> None:
+    inner = '<rgb name="{}" value=".9 .3 .06"/>'
+    found, said = opened(tmp_path, sphere(f'<bsdf type="roughconductor">{inner.format("alpha")}</bsdf>'))
+    assert found["shapes"]["sphere_1"]["material"]["alpha"] == pytest.approx(0.42) and not said
+    found, said = opened(tmp_path, sphere(f'<bsdf type="mask"><bsdf type="diffuse"/>{inner.format("opacity")}</bsdf>'))
+    assert found["shapes"]["sphere_1"]["material"]["opacity"] == pytest.approx(0.42) and not said

@@ -5,11 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from torchpt.core.errors import did_you_mean
-from torchpt.math.vectors import luminance
 from torchpt.scene.formats.mitsuba import values
 from torchpt.scene.formats.mitsuba.elements import Element, walk
 from torchpt.scene.formats.mitsuba.notes import Notes
@@ -211,11 +209,14 @@ class Properties:
         return list(found)
 
     def scalar(self, name: str, default: Any = None, *, high: float = 1.0) -> Any:
-        """Return a number in 0..``high`` or a texture, or ``default``; numbers outside are clamped, with a warning."""
+        """Return a number in 0..``high`` or a texture, or ``default``; numbers outside are clamped, with a warning.
+
+        Of a colour the mean is taken, as in Mitsuba.
+        """
         found = self.slot(name, None, bounded=False)
         if found is None or isinstance(found, dict):
             return default if found is None else found
-        value = found[0] if len(set(found)) == 1 else float(luminance(torch.tensor(found, dtype=torch.float64)))
+        value = found[0] if len(set(found)) == 1 else sum(found) / 3.0
         if value > high:
             self.note(f"{name} above {high:g} becomes {high:g}")
         return min(value, high)

@@ -35,8 +35,8 @@ LARGEST = float(np.finfo(np.float32).max)
 _TO_SRGB = np.array(
     [[3.240479, -1.537150, -0.498535], [-0.969256, 1.875991, 0.041556], [0.055648, -0.204043, 1.057311]]
 )
-# The tables at every nanometre, between whose points they are linear.
-_FINE = np.arange(WAVELENGTHS[0], WAVELENGTHS[-1] + 0.5)
+# The tables at the wavelengths where Mitsuba sums spectra up, half a nanometre apart; between their points they are linear.
+_FINE = np.linspace(WAVELENGTHS[0], WAVELENGTHS[-1], 1000)
 _OBSERVER = np.stack([np.interp(_FINE, WAVELENGTHS, row) for row in XYZ])
 _DAYLIGHT = np.interp(_FINE, WAVELENGTHS, D65)
 _HEX = re.compile(r"#[0-9a-fA-F]{6}\Z")
