@@ -6,9 +6,12 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from mitsuba_corpus import scene
+from PIL import Image
 
+import torchpt
 from torchpt.core.errors import ImportedSceneWarning, SceneError
 from torchpt.scene.formats.mitsuba import ImportOptions, read_mitsuba
 
@@ -148,3 +151,11 @@ def test_a_colour_in_place_of_a_number_is_its_mean(tmp_path: Path) -> None:
     assert found["shapes"]["sphere_1"]["material"]["alpha"] == pytest.approx(0.42) and not said
     found, said = opened(tmp_path, sphere(f'<bsdf type="mask"><bsdf type="diffuse"/>{inner.format("opacity")}</bsdf>'))
     assert found["shapes"]["sphere_1"]["material"]["opacity"] == pytest.approx(0.42) and not said
+
+
+def test_environments_of_16_bits_are_decoded(tmp_path: Path) -> None:
+    Image.fromarray(np.full((2, 4), 32768, np.uint16)).save(tmp_path / "deep.png")
+    emitter = '<emitter type="envmap"><string name="filename" value="deep.png"/></emitter>'
+    (tmp_path / "scene.xml").write_text(scene(emitter))
+    opened = torchpt.load(str(tmp_path / "scene.xml"), "cpu")
+    assert float(opened.params["lights.envmap_1.texels"].max()) == pytest.approx(0.21404, abs=1e-4)

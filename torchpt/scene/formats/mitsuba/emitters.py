@@ -94,7 +94,7 @@ def _envmap(p: Properties, importer: Importer) -> list[Light]:
         p.note("gamma is left out")
     if path is None:
         return [{"type": "constant", "radiance": [0.5 * scale] * 3}]
-    found: Light = {"type": "envmap", "path": importer.path(path)}
+    found: Light = {"type": "envmap", "path": importer.path(path), "colorspace": "srgb"}
     if scale != 1.0:
         found["scale"] = scale
     if not np.array_equal(matrix, np.eye(4)):
