@@ -558,7 +558,7 @@ def test_the_suns_of_a_time_stand_in_the_south_of_each_version(assets: Path) -> 
         ('<float name="stretch" value="0.5"/>', "stretch outside of 1..2 is clamped"),
         ('<float name="sun_radius_scale" value="300"/>', "a sun of more than 60 degrees"),
         ('<boolean name="extend" value="true"/>', "extend is left out"),
-        ('<transform name="to_world"><scale x="2"/></transform>', "a to_world that keeps no angles is left out"),
+        ('<transform name="to_world"><scale x="2"/></transform>', "the scale of to_world is left out"),
     ],
 )
 def test_what_a_sky_cannot_have_is_a_warning(assets: Path, inner: str, words: str) -> None:

@@ -159,3 +159,21 @@ def test_environments_of_16_bits_are_decoded(tmp_path: Path) -> None:
     (tmp_path / "scene.xml").write_text(scene(emitter))
     opened = torchpt.load(str(tmp_path / "scene.xml"), "cpu")
     assert float(opened.params["lights.envmap_1.texels"].max()) == pytest.approx(0.21404, abs=1e-4)
+
+
+@pytest.mark.parametrize("scale", ['value="2"', 'x="2"'])
+@pytest.mark.parametrize("type", ["envmap", "spot", "sunsky"])
+def test_a_scale_of_a_direction_is_said(tmp_path: Path, type: str, scale: str) -> None:
+    Image.fromarray(np.full((2, 4), 128, np.uint8)).save(tmp_path / "sky.png")
+    file = '<string name="filename" value="sky.png"/>' if type == "envmap" else ""
+    turn = '<rotate z="1" angle="10"/>'
+    text = f'<emitter type="{type}">{file}<transform name="to_world">{{}}{turn}</transform></emitter>'
+    found, said = opened(tmp_path, scene(text.format(f"<scale {scale}/>")))
+    assert len(said) == 1 and f'emitter "{type}": the scale of to_world is left out' in said[0]
+    with pytest.warns(ImportedSceneWarning):
+        torchpt.load(str(tmp_path / "scene.xml"), "cpu")
+    plain, nothing = opened(tmp_path, scene(text.format("")))
+    (light,), (expected,) = found["lights"].values(), plain["lights"].values()
+    assert not nothing
+    if type != "spot":
+        assert np.array(light["transform"][0]["matrix"]) == pytest.approx(np.array(expected["transform"][0]["matrix"]))
