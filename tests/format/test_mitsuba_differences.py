@@ -177,3 +177,27 @@ def test_a_scale_of_a_direction_is_said(tmp_path: Path, type: str, scale: str) -
     assert not nothing
     if type != "spot":
         assert np.array(light["transform"][0]["matrix"]) == pytest.approx(np.array(expected["transform"][0]["matrix"]))
+
+
+MAPPED = (
+    '<bsdf type="{}map"><texture type="checkerboard"/><bsdf type="{}map"><texture type="checkerboard"/>'
+    '<bsdf type="diffuse"/></bsdf></bsdf>'
+)
+
+
+@pytest.mark.parametrize(("outer", "inner"), [("normal", "bump"), ("bump", "normal"), ("bump", "bump")])
+def test_of_maps_inside_each_other_the_outer_one_is_taken(tmp_path: Path, outer: str, inner: str) -> None:
+    found, said = opened(tmp_path, sphere(MAPPED.format(outer, inner)))
+    keys = set(found["shapes"]["sphere_1"]["material"]) & {"normal_map", "bump_map"}
+    assert keys == {f"{outer}_map"}
+    assert len(said) == 1 and f'bsdf "{outer}map": the {inner}_map of the bsdf inside is left out' in said[0]
+
+
+def test_a_material_of_two_maps_is_refused_in_words() -> None:
+    texture = {"type": "checkerboard"}
+    material = {"type": "diffuse", "normal_map": texture, "bump_map": texture}
+    camera = {"origin": [0, 0, 3], "target": [0, 0, 0]}
+    with pytest.raises(SceneError) as caught:
+        torchpt.load({"version": 1, "camera": camera, "shapes": {"a": {"type": "sphere", "material": material}}}, "cpu")
+    assert "not both" in str(caught.value) and " object at " not in str(caught.value)
+    assert "Texture" not in str(caught.value)

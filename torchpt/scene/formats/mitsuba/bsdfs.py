@@ -183,7 +183,7 @@ def _twosided(p: Properties, importer: Importer) -> Material:
     inner = p.objects("bsdf")
     if not 1 <= len(inner) <= 2:
         raise p.element.error(p.element.label, f"one or two bsdf inside it, not {len(inner)}")
-    if len(inner) == 2:
+    if len(inner) == 2 and inner[0] is not inner[1]:
         p.note("the second bsdf, of the back, is left out: the first has both sides")
     material = dict(importer.material(inner[0]))
     material.pop("two_sided", None)
@@ -328,8 +328,9 @@ def _mapped(p: Properties, importer: Importer, key: str) -> Material:
     if isinstance(value, list):
         p.note("a constant map is left out")
         return material
-    if key in material:
-        p.note(f"the {key} of the bsdf inside is left out")
+    for other in _OUTER:
+        if material.pop(other, None) is not None:
+            p.note(f"the {other} of the bsdf inside is left out")
     if scale != 1.0:
         value = scaled(value, [scale] * 3, p)
     return material | {key: value}
@@ -406,7 +407,7 @@ BSDFS: dict[str, Plugin] = {
     "plastic": exact("plastic", _plastic),
     "roughplastic": exact("roughplastic", _rough_plastic, "phong becomes beckmann, with a warning; alpha is a number"),
     "principled": exact("principled", _principled),
-    "twosided": exact("two_sided", _twosided, "one bsdf for both sides"),
+    "twosided": exact("two_sided", _twosided, "two bsdf: nearest, the first has both sides, with a warning"),
     "mask": exact("opacity", _mask),
     "blendbsdf": exact("blend", _blend, "maps and opacity textures inside are left out, with a warning"),
     "mixturebsdf": exact("blend", _mixture, "as blendbsdf"),
