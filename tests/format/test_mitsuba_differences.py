@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from mitsuba_corpus import scene
 from PIL import Image
 
 import torchpt
 from torchpt.core.errors import ImportedSceneWarning, SceneError
+from torchpt.images.write import write_image
 from torchpt.scene.formats.mitsuba import ImportOptions, read_mitsuba
 
 
@@ -201,3 +203,34 @@ def test_a_material_of_two_maps_is_refused_in_words() -> None:
         torchpt.load({"version": 1, "camera": camera, "shapes": {"a": {"type": "sphere", "material": material}}}, "cpu")
     assert "not both" in str(caught.value) and " object at " not in str(caught.value)
     assert "Texture" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("slot", "name"),
+    [
+        ('<bsdf type="diffuse"><texture name="reflectance"', "reflectance"),
+        ('<bsdf type="roughconductor"><texture name="alpha"', "alpha"),
+        ('<bsdf type="mask"><bsdf type="diffuse"/><texture name="opacity"', "opacity"),
+        ('<bsdf type="blendbsdf"><bsdf type="diffuse"/><bsdf type="plastic"/><texture', "weight"),
+    ],
+)
+@pytest.mark.parametrize("shared", [False, True])
+def test_textures_of_more_than_1_are_clamped(tmp_path: Path, slot: str, name: str, shared: bool) -> None:
+    write_image(tmp_path / "bright.exr", torch.tensor([[[0.25, 0.25, 0.25], [3.0, 3.0, 3.0]]]))
+    own = ' id="bright"' if shared else ""
+    text = sphere(f'{slot} type="bitmap"{own}><string name="filename" value="bright.exr"/></texture></bsdf>')
+    found, said = opened(tmp_path, text)
+    texture = found["shapes"]["sphere_1"]["material"][name]
+    assert texture["clamp"] is True and texture["path"] == "bright.exr"
+    assert len(said) == 1 and f"values of the texture of {name} outside of 0..1 are clamped" in said[0]
+    with pytest.warns(ImportedSceneWarning):
+        loaded = torchpt.load(str(tmp_path / "scene.xml"), "cpu")
+    (texels,) = [texels for texels in loaded.params.values() if texels.shape[:2] == (1, 2)]
+    assert texels[0, :, 0].tolist() == [0.25, 1.0]
+
+
+def test_textures_within_1_are_left_alone(tmp_path: Path) -> None:
+    write_image(tmp_path / "grey.exr", torch.full((1, 2, 3), 0.5))
+    bitmap = '<texture name="{}" type="bitmap"><string name="filename" value="grey.exr"/></texture>'
+    found, said = opened(tmp_path, sphere(f'<bsdf type="diffuse">{bitmap.format("reflectance")}</bsdf>'))
+    assert "clamp" not in found["shapes"]["sphere_1"]["material"]["reflectance"] and not said

@@ -207,7 +207,7 @@ def _blend(p: Properties, importer: Importer) -> Material:
     if len(inner) != 2:
         raise p.element.error(p.element.label, f"two bsdf inside it, not {len(inner)}")
     textures = [] if p.has("weight") else p.objects("texture")
-    weight = importer.texture(textures[0]) if textures else p.scalar("weight", 0.5)
+    weight = p.fraction(importer.texture(textures[0]), "weight") if textures else p.scalar("weight", 0.5)
     if isinstance(weight, list):
         weight = weight[0]
     return _blended([importer.material(element) for element in inner], weight, p)

@@ -13,6 +13,7 @@ import numpy as np
 
 from torchpt.core.errors import AssetError, SceneError, did_you_mean
 from torchpt.core.files import is_regular
+from torchpt.images.texels import read_texels
 from torchpt.math.transforms import is_usable
 from torchpt.scene.formats.mitsuba.bsdfs import BSDFS, UNKNOWN, opacity_of
 from torchpt.scene.formats.mitsuba.elements import Element, parse_scene, walk
@@ -295,6 +296,21 @@ class Importer:
         name = self._key(self.textures, element)
         self.textures[name] = value
         return {"texture": name}
+
+    def exceeds_one(self, texture: Mapping[str, Any]) -> bool:
+        """Return True for a texture with values outside of 0..1: images of floats are read to see."""
+        if texture["type"] != "image":
+            return max((*texture.get("color0", ()), *texture.get("color1", ()), 0.0)) > 1.0
+        scale = max(map(abs, texture.get("scale", (1.0,))))
+        path = self.base / texture["path"]
+        if scale <= 1.0 and path.suffix.lower() not in (".exr", ".hdr"):
+            return False
+        try:
+            picture = read_texels(path)
+        except AssetError:
+            return False  # refused when the scene is built, with more words
+        values = picture.decoded if texture["colorspace"] == "srgb" and picture.white is not None else picture.values
+        return bool(values.min() < 0.0 or values.max() * scale > 1.0 + 1e-6)
 
     def _key(self, taken: Mapping[str, Any], element: Element) -> str:
         """Return the key of a material or a texture that has an id; ids that make the same key get one each."""

@@ -195,7 +195,8 @@ class Properties:
         """
         texture = self._texture(name)
         if texture is not None:
-            return self.importer.texture(texture)
+            found = self.importer.texture(texture)
+            return self.fraction(found, name) if bounded and not light else found
         element = self._value(name)
         if element is None:
             return default
@@ -215,11 +216,21 @@ class Properties:
         """
         found = self.slot(name, None, bounded=False)
         if found is None or isinstance(found, dict):
-            return default if found is None else found
+            return default if found is None else self.fraction(found, name) if high == 1.0 else found
         value = found[0] if len(set(found)) == 1 else sum(found) / 3.0
         if value > high:
             self.note(f"{name} above {high:g} becomes {high:g}")
         return min(value, high)
+
+    def fraction(self, value: Any, name: str) -> Any:
+        """Return a texture as one of values in 0..1; note where it has others. Colours are returned as they are."""
+        texture = self.importer.textures[value["texture"]] if isinstance(value, dict) and "texture" in value else value
+        if isinstance(texture, list) or not self.importer.exceeds_one(texture):
+            return value
+        self.note(f"values of the texture of {name} outside of 0..1 are clamped")
+        if texture["type"] == "image":
+            return texture | {"clamp": True}
+        return texture | {key: [min(x, 1.0) for x in texture[key]] for key in ("color0", "color1") if key in texture}
 
     def objects(self, *tags: str) -> list[Element]:
         """Return the objects of some tags, in the order of the file."""
