@@ -234,3 +234,45 @@ def test_textures_within_1_are_left_alone(tmp_path: Path) -> None:
     bitmap = '<texture name="{}" type="bitmap"><string name="filename" value="grey.exr"/></texture>'
     found, said = opened(tmp_path, sphere(f'<bsdf type="diffuse">{bitmap.format("reflectance")}</bsdf>'))
     assert "clamp" not in found["shapes"]["sphere_1"]["material"]["reflectance"] and not said
+
+
+def test_an_area_emitter_that_shapes_refer_to_is_on_them(tmp_path: Path) -> None:
+    lamp = '<emitter type="area" id="lamp"><rgb name="radiance" value="2"/></emitter>'
+    found, said = opened(tmp_path, scene(lamp + '<shape type="sphere"><ref id="lamp"/></shape>'))
+    assert found["shapes"]["sphere_1"]["emission"] == [2.0] * 3 and not said
+    _, said = opened(tmp_path, scene(lamp + '<shape type="sphere"/>'))
+    assert 'emitter "area" is left out: it is on no shape' in said[0]
+
+
+HEAD = '<scene version="3.0.0">'
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ('<sensor type="perspective"><film type="hdrfilm"/><film type="hdrfilm"/><float name="fov" value="40"/></sensor>',
+         'sensor "perspective": only the last film of several is taken'),
+        ('<sensor type="perspective"><sampler type="sobol"/><sampler type="sobol"/><float name="fov" value="40"/></sensor>',
+         'sensor "perspective": only the last sampler of several is taken'),
+        ('<sensor type="orthographic"><float name="principal_point_offset_x" value=".1"/></sensor>',
+         'sensor "orthographic": principal_point_offset_x is left out'),
+        ('<integrator type="path"/><integrator type="direct"/>', "all integrators but the last are left out"),
+        ('<integrator type="volpath"><integer name="max_dept" value="3"/></integrator>',
+         'integrator "volpath": the property max_dept is unknown here'),
+        ('<shape type="sphere"><bsdf type="roughconductor"><float name="alpha_u" value=".2"/></bsdf></shape>',
+         'bsdf "roughconductor": alpha_u without alpha_v, which becomes 0.1'),
+    ],
+)  # fmt: skip
+def test_what_stands_twice_or_alone_is_said(tmp_path: Path, body: str, words: str) -> None:
+    sensor = "" if "sensor" in body else '<sensor type="perspective"><float name="fov" value="40"/></sensor>'
+    _, said = opened(tmp_path, f'{HEAD}{body}{sensor}<shape type="sphere"/></scene>')
+    assert any(words in text for text in said), said
+
+
+@pytest.mark.parametrize(
+    ("value", "expected", "count"), [(".8 .3 .2", [0.8, 0.3, 0.2], 0), ("2 .5 .5", [1.0, 0.5, 0.5], 1)]
+)
+def test_a_texture_of_one_colour_is_that_colour(tmp_path: Path, value: str, expected: list[float], count: int) -> None:
+    texture = f'<texture type="srgb" name="reflectance"><rgb name="color" value="{value}"/></texture>'
+    found, said = opened(tmp_path, sphere(f'<bsdf type="diffuse">{texture}</bsdf>'))
+    assert found["shapes"]["sphere_1"]["material"]["reflectance"] == expected and len(said) == count

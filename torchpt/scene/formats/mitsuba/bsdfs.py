@@ -99,6 +99,9 @@ def _alphas(p: Properties) -> Material:
     """Return the distribution of facets and their roughness, for two directions where they are given."""
     found: Material = {"distribution": _distribution(p)}
     if p.has("alpha_u", "alpha_v"):
+        for one, other in (("alpha_u", "alpha_v"), ("alpha_v", "alpha_u")):
+            if not p.has(one):
+                p.note(f"{other} without {one}, which becomes 0.1")
         return found | {key: p.scalar(key, 0.1) for key in ("alpha_u", "alpha_v")}
     return found | {"alpha": p.scalar("alpha", 0.1)}
 

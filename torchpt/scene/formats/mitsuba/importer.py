@@ -355,6 +355,8 @@ class Importer:
         for child in sensor.children:
             target = self.target(child) if child.tag == "ref" else child
             if target.tag in ("film", "sampler"):
+                if target.tag in inner:
+                    self.notes.add(target, f"{sensor.label}: only the last {target.tag} of several is taken")
                 inner[target.tag] = target
             else:
                 rest.append(child)
@@ -369,6 +371,8 @@ class Importer:
         integrator: dict[str, Any] = {"type": "path", "max_depth": -1}
         if self.root.version < (2,):  # without one, Mitsuba took direct light
             integrator = {"type": "direct"}
+        if len(integrators) > 1:
+            self.notes.add(integrators[-1], "all integrators but the last are left out")
         if integrators:
             integrator = self.build(INTEGRATORS, integrators[-1], UNKNOWN_INTEGRATOR)
         layers = integrator.pop("aovs", [])
@@ -551,6 +555,8 @@ class Importer:
     def _emitter(self, element: Element) -> None:
         """Add a light that is on no shape."""
         if plugin_name(element.tag, element.type) == "area":
+            if self._is_on_a_shape(element):
+                return
             self.notes.add(element, f"{element.label} is left out: it is on no shape")
             return
         for light in self.build(EMITTERS, element, _UNKNOWN) or ():
@@ -561,6 +567,11 @@ class Importer:
                 self.notes.add(element, f"{element.label} is left out: there is an environment before it")
                 continue
             self.lights[self._free(self.lights, element, light["type"])] = light
+
+    def _is_on_a_shape(self, emitter: Element) -> bool:
+        """Return True for an emitter to which a ``<ref>`` in a shape leads."""
+        references = (child for shape in walk(self.root) if shape.tag == "shape" for child in shape.children)
+        return any(child.tag == "ref" and self.target(child) is emitter for child in references)
 
     def _free(self, taken: Mapping[str, Any], element: Element, kind: str = "") -> str:
         """Return a name that is not taken: the id of an element, else its type and a number."""

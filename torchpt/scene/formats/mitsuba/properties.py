@@ -223,11 +223,13 @@ class Properties:
         return min(value, high)
 
     def fraction(self, value: Any, name: str) -> Any:
-        """Return a texture as one of values in 0..1; note where it has others. Colours are returned as they are."""
+        """Return a texture, or a colour in place of one, as one of values in 0..1; note where it has others."""
         texture = self.importer.textures[value["texture"]] if isinstance(value, dict) and "texture" in value else value
-        if isinstance(texture, list) or not self.importer.exceeds_one(texture):
+        if not (max(value) > 1.0 if isinstance(value, list) else self.importer.exceeds_one(texture)):
             return value
         self.note(f"values of the texture of {name} outside of 0..1 are clamped")
+        if isinstance(value, list):
+            return [min(x, 1.0) for x in value]
         if texture["type"] == "image":
             return texture | {"clamp": True}
         return texture | {key: [min(x, 1.0) for x in texture[key]] for key in ("color0", "color1") if key in texture}
