@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from mitsuba_corpus import scene
+from mitsuba_corpus import scene, write_assets
 from PIL import Image
 
 import torchpt
-from torchpt.core.errors import ImportedSceneWarning, SceneError
+from torchpt.core.errors import AssetError, ImportedSceneWarning, SceneError
 from torchpt.images.write import write_image
 from torchpt.scene.formats.mitsuba import ImportOptions, read_mitsuba
 
@@ -276,3 +276,36 @@ def test_a_texture_of_one_colour_is_that_colour(tmp_path: Path, value: str, expe
     texture = f'<texture type="srgb" name="reflectance"><rgb name="color" value="{value}"/></texture>'
     found, said = opened(tmp_path, sphere(f'<bsdf type="diffuse">{texture}</bsdf>'))
     assert found["shapes"]["sphere_1"]["material"]["reflectance"] == expected and len(said) == count
+
+
+@pytest.mark.parametrize(
+    ("plugin", "file"), [("ply", "tent.ply"), ("obj", "roof.obj"), ("serialized", "two.serialized")]
+)
+@pytest.mark.parametrize("ending", ["", ".dat", ".stl"])
+def test_meshes_are_read_by_their_plugin_whatever_their_ending(
+    tmp_path: Path, plugin: str, file: str, ending: str
+) -> None:
+    write_assets(tmp_path)
+    copy = f"copy{ending}"
+    (tmp_path / copy).write_bytes((tmp_path / "meshes" / file).read_bytes())
+    text = f'<shape type="{plugin}"><string name="filename" value="{{}}"/></shape>'
+    pictures = []
+    for name in (copy, f"meshes/{file}"):
+        (tmp_path / "scene.xml").write_text(scene(text.format(name) + '<emitter type="constant"/>'))
+        opened = torchpt.load(str(tmp_path / "scene.xml"), "cpu", overrides={"film.width": 8, "film.height": 8})
+        pictures.append(torchpt.render(opened, spp=2, seed=0, compile="off"))
+    assert torch.equal(*pictures)
+
+
+@pytest.mark.parametrize("kind", ["png", "exr"])
+def test_images_are_known_by_their_content(tmp_path: Path, kind: str) -> None:
+    write_image(tmp_path / f"grey.{kind}", torch.full((1, 2, 3), 0.5))
+    (tmp_path / "grey").write_bytes((tmp_path / f"grey.{kind}").read_bytes())
+    bitmap = '<texture name="reflectance" type="bitmap"><string name="filename" value="grey"/></texture>'
+    (tmp_path / "scene.xml").write_text(sphere(f'<bsdf type="diffuse">{bitmap}</bsdf>'))
+    loaded = torchpt.load(str(tmp_path / "scene.xml"), "cpu")
+    (texels,) = [texels for texels in loaded.params.values() if texels.shape[:2] == (1, 2)]
+    assert texels.max().item() == pytest.approx(0.5, abs=0.01)
+    (tmp_path / "grey").write_text("words")
+    with pytest.raises(AssetError, match="unknown kind of image ''"):
+        torchpt.load(str(tmp_path / "scene.xml"), "cpu")

@@ -303,7 +303,7 @@ class Importer:
             return max((*texture.get("color0", ()), *texture.get("color1", ()), 0.0)) > 1.0
         scale = max(map(abs, texture.get("scale", (1.0,))))
         path = self.base / texture["path"]
-        if scale <= 1.0 and path.suffix.lower() not in (".exr", ".hdr"):
+        if scale <= 1.0 and path.suffix.lower() in _WHOLE:
             return False
         try:
             picture = read_texels(path)
@@ -584,6 +584,7 @@ class Importer:
         return f"{stem}_{number}"
 
 
+_WHOLE = (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".ppm", ".pgm")  # images of whole numbers, which are at most 1
 _ENVIRONMENTS = ("envmap", "constant", "sky")
 
 
