@@ -309,3 +309,58 @@ def test_images_are_known_by_their_content(tmp_path: Path, kind: str) -> None:
     (tmp_path / "grey").write_text("words")
     with pytest.raises(AssetError, match="unknown kind of image ''"):
         torchpt.load(str(tmp_path / "scene.xml"), "cpu")
+
+
+BAD_CAMERA = '<sensor type="thinlens">\n<float name="{}" value="{}"/>\n<float name="{}" value="1"/>\n</sensor>\n'
+FILM = '<sensor type="perspective">\n<float name="fov" value="40"/>\n<film type="hdrfilm">\n{}\n</film>\n</sensor>\n'
+WIDTH = '<integer name="width" value="8"/><integer name="height" value="8"/>'
+
+
+@pytest.mark.parametrize(
+    ("body", "where"),
+    [
+        (BAD_CAMERA.format("fov", 0, "aperture_radius"), 'line 3, sensor "thinlens" fov: '),
+        (BAD_CAMERA.format("fov", 180, "aperture_radius"), 'line 3, sensor "thinlens" fov: '),
+        (BAD_CAMERA.format("aperture_radius", -1, "fov"), 'line 3, sensor "thinlens" aperture_radius: '),
+        (BAD_CAMERA.format("focus_distance", 0, "fov"), 'line 3, sensor "thinlens" focus_distance: '),
+        (FILM.format('<integer name="width" value="0"/>'), 'line 5, film "hdrfilm" width: '),
+        (FILM.format(WIDTH + '<integer name="crop_width" value="9"/>'), 'line 4, film "hdrfilm": '),
+        (FILM.format('<rfilter type="tent"><float name="radius" value="0"/></rfilter>'), 'line 5, rfilter "tent" radius: '),
+        ('<integrator type="path">\n<integer name="max_depth" value="99999999999"/></integrator>',
+         'line 3, integrator "path" max_depth: '),
+        ('<shape type="sphere">\n<float name="radius" value="1 2"/></shape>',
+         "line 3, float radius: expected 1 number, got '1 2'"),
+        ('<shape type="sphere"><bsdf type="diffuse">\n<rgb name="reflectance" value=".1 .2"/></bsdf></shape>',
+         "line 3, rgb reflectance: expected 1 or 3 numbers, got '.1 .2'"),
+        ('<shape type="obj">\n<string name="filename" value="no.obj"/></shape>', "line 3, string filename: "),
+        ('<shape type="obj"><string name="filename" value="scene.xml"/>\n</shape>', "no face"),
+        ('<emitter type="envmap">\n<float name="scale" value="-1"/><string name="filename" value="sky.png"/></emitter>',
+         'line 3, emitter "envmap" scale: '),
+    ],
+)  # fmt: skip
+def test_errors_of_values_name_line_and_element(tmp_path: Path, body: str, where: str) -> None:
+    Image.fromarray(np.full((2, 4), 128, np.uint8)).save(tmp_path / "sky.png")
+    sensor = "" if "sensor" in body else '<sensor type="perspective"><float name="fov" value="40"/></sensor>'
+    file = tmp_path / "scene.xml"
+    file.write_text(f"{HEAD}\n{body}{sensor}</scene>")
+    with pytest.raises((SceneError, AssetError)) as caught:
+        torchpt.load(str(file), "cpu")
+    said = str(caught.value)
+    assert "\n" not in said and (said.startswith(f"{file}: {where}") or "no face" in where in said), said
+
+
+def test_an_override_is_at_fault_itself(tmp_path: Path) -> None:
+    file = tmp_path / "scene.xml"
+    file.write_text(scene('<shape type="sphere" id="ball"/>'))
+    with pytest.raises(SceneError, match=r"^camera\.fov: expected"):
+        torchpt.load(str(file), "cpu", overrides={"camera.fov": 300})
+    with pytest.raises(SceneError, match=r"^film\.width: expected"):
+        torchpt.load(str(file), "cpu", overrides={"film.width": 0})
+
+
+@pytest.mark.parametrize(("version", "green"), [("0.6.0", 0x80 / 255), ("3.0.0", 0.2158605)])
+def test_hexadecimal_colours_are_linear_before_version_2(tmp_path: Path, version: str, green: float) -> None:
+    bsdf = '<shape type="sphere"><bsdf type="diffuse"><{0} name="reflectance" value="#ff8000"/></bsdf></shape>'
+    for tag, expected in (("rgb", green), ("srgb", 0.2158605)):
+        found, _ = opened(tmp_path, scene(bsdf.format(tag), version))
+        assert found["shapes"]["sphere_1"]["material"]["reflectance"] == pytest.approx([1.0, expected, 0.0])

@@ -33,9 +33,9 @@ from torchpt.scene.formats.mitsuba.sensors import (
 )
 from torchpt.scene.formats.mitsuba.shapes import SHAPES, bounds, posed, with_attribute
 from torchpt.scene.formats.mitsuba.textures import TEXTURES, attributes_of, scaled
-from torchpt.scene.formats.mitsuba.versions import plugin_name
+from torchpt.scene.formats.mitsuba.versions import plugin_name, property_name
 
-__all__ = ["PLUGINS", "ImportOptions", "Importer", "read_mitsuba", "split_import_keys"]
+__all__ = ["PLUGINS", "ImportOptions", "Importer", "import_mitsuba", "read_mitsuba", "split_import_keys"]
 
 #: The tables of plugins by tag.
 PLUGINS: dict[str, Mapping[str, Plugin]] = {
@@ -123,6 +123,11 @@ def _as_text(key: str, value: Any) -> str:
 
 
 def read_mitsuba(path: Path, file: str, options: ImportOptions) -> dict[str, Any]:
+    """Read a scene of Mitsuba; see :func:`import_mitsuba`."""
+    return import_mitsuba(path, file, options)[0]
+
+
+def import_mitsuba(path: Path, file: str, options: ImportOptions) -> tuple[dict[str, Any], dict[str, str]]:
     """Read a scene of Mitsuba.
 
     Args:
@@ -132,7 +137,7 @@ def read_mitsuba(path: Path, file: str, options: ImportOptions) -> dict[str, Any
 
     Returns:
         The scene in the form of a YAML file; relative paths start at the file's folder. Shapes may have ``mesh`` in place of
-        ``path``: parts that are not as the file has them.
+        ``path``: parts that are not as the file has them. And where its keys come from, by dotted key: file, line and element.
 
     Raises:
         SceneError: a scene that cannot be read, with its line; a missing file; any warning where the import is strict.
@@ -144,7 +149,7 @@ def read_mitsuba(path: Path, file: str, options: ImportOptions) -> dict[str, Any
     importer = Importer(root, path.resolve().parent, options, left_out)
     scene = importer.scene()
     importer.notes.warn()
-    return scene
+    return scene, importer.places
 
 
 class Importer:
@@ -156,6 +161,7 @@ class Importer:
         textures: named textures that something uses, by name.
         shapes: shapes by name.
         lights: lights by name.
+        places: file, line and element that keys of the scene come from, by dotted key.
     """
 
     def __init__(self, root: Element, base: Path, options: ImportOptions, left_out: Sequence[Element]) -> None:
@@ -165,6 +171,7 @@ class Importer:
         self.textures: dict[str, Any] = {}
         self.shapes: dict[str, Any] = {}
         self.lights: dict[str, Any] = {}
+        self.places: dict[str, str] = {}
         self._meshes_of_groups: dict[int, dict[int, str]] = {}  # by id of a group: shape drawn, by id of its element
         self._depth = 0
         self._folders = [base]
@@ -219,6 +226,14 @@ class Importer:
             SceneError: nothing has this id.
         """
         return self._with_id(reference.attributes.get("id", ""), reference)
+
+    def locate(self, key: str, element: Element) -> None:
+        """Keep where a key of the scene comes from, and those below it that the element's properties give."""
+        self.places[key] = element.place
+        for child in element.children:
+            name = property_name(element.tag, plugin_name(element.tag, element.type), child.attributes.get("name", ""))
+            if name and child.tag in VALUES:
+                self.places[f"{key}.{name}"] = f"{child.file}: line {child.line}, {element.label} {name}"
 
     # ---- Files
 
@@ -295,6 +310,7 @@ class Importer:
             return value
         name = self._key(self.textures, element)
         self.textures[name] = value
+        self.locate(f"textures.{name}", element)
         return {"texture": name}
 
     def exceeds_one(self, texture: Mapping[str, Any]) -> bool:
@@ -363,6 +379,13 @@ class Importer:
         bare = replace(sensor, children=rest)
         camera = self.build(SENSORS, bare, _UNKNOWN_SENSOR) if sensors else {}
         film = {"width": 768, "height": 576, "filter": {"type": "gaussian"}}
+        self.locate("camera", sensor)
+        for key, tag in (("film", "film"), ("sampler", "sampler"), ("render.spp", "sampler")):
+            if tag in inner:
+                self.locate(key, inner[tag])
+        for child in inner["film"].children if "film" in inner else ():
+            if child.tag == "rfilter":
+                self.locate("film.filter", child)
         if "film" in inner:
             film = self.build(FILMS, inner["film"], UNKNOWN_FILM)
         sampler, count = "independent", 4
@@ -375,6 +398,7 @@ class Importer:
             self.notes.add(integrators[-1], "all integrators but the last are left out")
         if integrators:
             integrator = self.build(INTEGRATORS, integrators[-1], UNKNOWN_INTEGRATOR)
+            self.locate("integrator", integrators[-1])
         layers = integrator.pop("aovs", [])
         if integrator["type"] != "aov":
             integrator = integrator | {"dark_rims": True}
@@ -417,7 +441,17 @@ class Importer:
             return
         shape = self._plain_shape(element)
         if shape is not None:
-            self.shapes[self._free(self.shapes, element)] = shape
+            self._add_shape(element, shape)
+
+    def _add_shape(self, element: Element, shape: dict[str, Any]) -> str:
+        """Add a shape to the scene; return its name."""
+        name = self._free(self.shapes, element)
+        self.shapes[name] = shape
+        self.locate(f"shapes.{name}", element)
+        for child in element.children:
+            if child.tag == "bsdf":
+                self.locate(f"shapes.{name}.material", child)
+        return name
 
     def _merge(self, element: Element) -> None:
         """Add the shapes of a ``merge``, which keep their own materials."""
@@ -485,6 +519,7 @@ class Importer:
             return material, None
         name = self._key(self.materials, element)
         self.materials[name] = material
+        self.locate(f"materials.{name}", element)
         return material, name
 
     def _radiance(self, element: Element, opacity: float | None) -> Any:
@@ -534,9 +569,7 @@ class Importer:
             before = self.shapes.get(drawn.get(id(target), ""))
             shape = self._plain_shape(target) if before is None or before["type"] != "mesh" else None
             if shape is not None:
-                name = self._free(self.shapes, target)
-                self.shapes[name] = posed(shape, pose)
-                drawn[id(target)] = name
+                drawn[id(target)] = self._add_shape(target, posed(shape, pose))
             elif before is not None:
                 total = pose @ self._own_pose(target)
                 if not is_usable(total):
@@ -544,7 +577,7 @@ class Importer:
                     continue
                 sides = {"flip_normals": True} if before.get("flip_normals") else {}  # a copy has its own
                 copy = posed({"type": "instance", "of": drawn[id(target)], **sides}, total)
-                self.shapes[self._free(self.shapes, target)] = copy
+                self._add_shape(target, copy)
 
     def _own_pose(self, element: Element) -> Any:
         """Return the transform of a shape of a group."""
@@ -566,7 +599,9 @@ class Importer:
                     continue
                 self.notes.add(element, f"{element.label} is left out: there is an environment before it")
                 continue
-            self.lights[self._free(self.lights, element, light["type"])] = light
+            name = self._free(self.lights, element, light["type"])
+            self.lights[name] = light
+            self.locate(f"lights.{name}", element)
 
     def _is_on_a_shape(self, emitter: Element) -> bool:
         """Return True for an emitter to which a ``<ref>`` in a shape leads."""

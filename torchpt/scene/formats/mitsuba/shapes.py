@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchpt.core.errors import AssetError, SceneError
+from torchpt.core.errors import AssetError
 from torchpt.math.transforms import affine, apply_points, is_usable, similarity_scale
 from torchpt.math.vectors import Frame
 from torchpt.physics.shapes import KINDS
@@ -129,7 +129,7 @@ def _parts(p: Properties, path: Path, index: int | None) -> Sequence[MeshPart]:
     try:
         return load_mesh(path, materials=False, index=index, ending=_ending(p))
     except AssetError as error:
-        raise SceneError(f"line {p.element.line}", str(path), error.problem, p.element.file) from None
+        raise p.element.error(str(path), f"a mesh that can be read ({error.problem})") from None
 
 
 def _joined(parts: Sequence[MeshPart], *, flips: bool) -> MeshPart:
@@ -190,9 +190,9 @@ def with_attribute(shape: Shape, names: Sequence[str], element: Element, importe
             if part is not None and part.uvs is not None and flipped:
                 part = replace(part, uvs=_upside_down(part.uvs))
         except OSError as error:
-            raise SceneError(f"line {element.line}", str(path), f"a file ({error.strerror})", element.file) from None
+            raise element.error(str(path), f"a file that can be read ({error.strerror})") from None
         except AssetError as error:
-            raise SceneError(f"line {element.line}", str(path), error.problem, element.file) from None
+            raise element.error(str(path), f"a mesh that can be read ({error.problem})") from None
     if part is not None:
         return {**{key: value for key, value in shape.items() if key != "path"}, "mesh": (part,)}
     if name != "vertex_color" or (path is not None and plugin == "ply"):

@@ -59,7 +59,8 @@ def numbers(element: Element, text: str, counts: Sequence[int] = ()) -> list[flo
     except ValueError:
         raise element.error(text, "numbers between blanks or commas") from None
     if not found or (counts and len(found) not in counts):
-        raise element.error(text, f"{' or '.join(map(str, counts)) or 'some'} numbers")
+        words = " or ".join(map(str, counts)) or "some"
+        raise element.error(text, f"{words} number{'' if words == '1' else 's'}")
     if not all(abs(value) <= LARGEST for value in found):  # false for NaN
         raise element.error(text, "finite numbers")
     return found
@@ -115,7 +116,8 @@ def colour(element: Element, *, light: bool, find: FindFile) -> Rgb:
     text = element.attributes.get("value", "").strip()
     if _HEX.match(text):
         value = np.array([int(text[k : k + 2], 16) / 255.0 for k in (1, 3, 5)])
-        return _rgb(_decoded(value))
+        # Before version 2 Mitsuba took those of <rgb> as linear.
+        return _rgb(value if element.tag == "rgb" and element.version < (2,) else _decoded(value))
     found = np.array(numbers(element, text, (1, 3)))
     found = np.broadcast_to(found, 3)
     return _rgb(_decoded(found) if element.tag == "srgb" else found)
