@@ -342,7 +342,8 @@ def test_a_missing_file_is_an_error_or_grey(assets: Path) -> None:
         '<emitter type="envmap"><string name="filename" value="none.exr"/></emitter>'
     )
     assert error(assets, text) == (
-        "scene.xml: line 10, string filename: expected a file that is there (import.missing=warn goes on without it), got 'none.png'"
+        "scene.xml: line 10, string filename: expected a file that is there (import.missing=warn goes on without it), "
+        "got 'none.png'"
     )
     found = read(assets, text, missing=True)
     assert list(found["shapes"]) == ["rectangle_1"] and found["lights"]["constant_1"]["radiance"] == [0.5] * 3
