@@ -271,17 +271,18 @@ def _direct(p: Properties, importer: Importer) -> Block:
     return {"type": "direct"}
 
 
-#: Settings of the integrators that become another one, in any version, without meaning for that.
+#: Settings of the integrators that become another one, in any version and in published scenes, without meaning for that.
 _SETTINGS = (
     "alpha", "bidirectional", "bidirectional_mutation", "block_size", "brute_force", "caustic_lookup_radius",
     "caustic_perturbation", "caustic_photons", "chain_length", "clamp_neighbor", "clamp_screen", "clamping", "debug",
-    "direct_samples", "direct_sampling", "explicit_sampling", "global_lookup_radius", "global_photons", "glossy_samples",
-    "gradients", "granularity", "guiding", "guiding_proj", "guiding_rounds", "indirect_only", "initial_radius", "lambda",
-    "lens_perturbation", "light_image", "lookup_size", "luminance_samples", "manifold_perturbation", "max_chains", "max_error",
-    "max_passes", "max_sample_factor", "meridian_align", "multi_chain_perturbation", "num_chains", "overture", "p_large",
-    "p_value", "photon_count", "proj_seed", "quality", "quality_adjustment", "rays", "resolution", "sample_direct",
-    "samples_per_pass", "separate_direct", "shadow_map_resolution", "sppc", "sppi", "sppp", "timeout", "two_stage",
-    "use_spectral_mis", "volume_lookup_radius", "volume_photons",
+    "direct_samples", "direct_sampling", "dual_buffer", "explicit_sampling", "global_lookup_radius", "global_photons",
+    "glossy_samples", "gradients", "granularity", "guiding", "guiding_proj", "guiding_rounds", "indirect_only",
+    "initial_radius", "k_nn", "lambda", "lens_perturbation", "light_image", "lookup_size", "luminance_samples",
+    "manifold_perturbation", "max_chains", "max_error", "max_passes", "max_sample_factor", "meridian_align",
+    "multi_chain_perturbation", "num_chains", "overture", "p_large", "p_value", "photon_count", "proj_seed", "quality",
+    "quality_adjustment", "rays", "resolution", "sample_direct", "samples_per_pass", "separate_direct",
+    "shadow_map_resolution", "sppc", "sppi", "sppp", "step_snapshot", "timeout", "two_stage", "use_spectral_mis",
+    "volume_lookup_radius", "volume_photons",
 )  # fmt: skip
 
 
