@@ -331,6 +331,8 @@ def _mapped(p: Properties, importer: Importer, key: str) -> Material:
     if isinstance(value, list):
         p.note("a constant map is left out")
         return material
+    if key == "normal_map":
+        value = p.fraction(value, "normals")
     for other in _OUTER:
         if material.pop(other, None) is not None:
             p.note(f"the {other} of the bsdf inside is left out")
