@@ -368,3 +368,11 @@ def test_hexadecimal_colours_are_linear_before_version_2(tmp_path: Path, version
     for tag, expected in (("rgb", green), ("srgb", 0.2158605)):
         found, _ = opened(tmp_path, scene(bsdf.format(tag), version))
         assert found["shapes"]["sphere_1"]["material"]["reflectance"] == pytest.approx([1.0, expected, 0.0])
+
+
+def test_samples_beyond_the_border_need_no_warning(tmp_path: Path) -> None:
+    film = '<film type="hdrfilm"><boolean name="sample_border" value="true"/></film>'
+    _, said = opened(
+        tmp_path, f'{HEAD}<sensor type="perspective">{film}<float name="fov" value="40"/></sensor></scene>'
+    )
+    assert not said
