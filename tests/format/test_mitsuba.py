@@ -342,7 +342,8 @@ def test_a_missing_file_is_an_error_or_grey(assets: Path) -> None:
         '<emitter type="envmap"><string name="filename" value="none.exr"/></emitter>'
     )
     assert error(assets, text) == (
-        "scene.xml: line 10: expected a file that is there (import.missing=warn goes on without it), got 'none.png'"
+        "scene.xml: line 10, string filename: expected a file that is there (import.missing=warn goes on without it), "
+        "got 'none.png'"
     )
     found = read(assets, text, missing=True)
     assert list(found["shapes"]) == ["rectangle_1"] and found["lights"]["constant_1"]["radiance"] == [0.5] * 3
@@ -558,7 +559,7 @@ def test_the_suns_of_a_time_stand_in_the_south_of_each_version(assets: Path) -> 
         ('<float name="stretch" value="0.5"/>', "stretch outside of 1..2 is clamped"),
         ('<float name="sun_radius_scale" value="300"/>', "a sun of more than 60 degrees"),
         ('<boolean name="extend" value="true"/>', "extend is left out"),
-        ('<transform name="to_world"><scale x="2"/></transform>', "a to_world that keeps no angles is left out"),
+        ('<transform name="to_world"><scale x="2"/></transform>', "the scale of to_world is left out"),
     ],
 )
 def test_what_a_sky_cannot_have_is_a_warning(assets: Path, inner: str, words: str) -> None:

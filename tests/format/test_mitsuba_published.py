@@ -256,7 +256,7 @@ def test_document_types_without_entities_are_read(tmp_path: Path) -> None:
 def test_blanks_before_the_declaration_keep_lines(tmp_path: Path) -> None:
     text = '\n <?xml version="1.0" encoding="utf-8"?>' + scene('<shape type="sphere"/>')
     read(tmp_path, text)
-    with pytest.raises(SceneError, match="line 12: "):
+    with pytest.raises(SceneError, match="line 12, ref: "):
         read(tmp_path, text.replace("</scene>", '<ref id="none"/></scene>').replace("<shape", "\n\n<shape"))
 
 

@@ -214,22 +214,32 @@ def test_a_turned_map_has_a_derivative(quadrants):
     assert float(other.grad) == pytest.approx(float(difference), rel=0.1)
 
 
-def test_pictures_of_eight_bits_are_srgb(tmp_path):
-    from torchpt.images.colour import srgb_to_linear
-
-    grey = np.full((4, 8), 128, np.uint8)
+@pytest.mark.parametrize(
+    ("grey", "colorspace", "decoded"),
+    [
+        (np.uint8(128), {}, True),
+        (np.uint8(128), {"colorspace": "linear"}, False),
+        (np.uint16(32896), {}, False),
+        (np.uint16(32896), {"colorspace": "srgb"}, True),
+    ],
+)
+def test_pictures_of_eight_bits_are_srgb_unless_the_scene_says_otherwise(tmp_path, grey, colorspace, decoded):
     import imageio.v3 as iio
 
-    iio.imwrite(tmp_path / "grey.png", grey)
-    scene = torchpt.load({"camera": {"origin": [0, 0, 1], "target": [0, 0, 0]},
-                          "lights": {"sky": {"type": "envmap", "path": str(tmp_path / "grey.png")}}}, "cpu")  # fmt: skip
-    expected = srgb_to_linear(torch.tensor(128 / 255.0))
+    from torchpt.images.colour import srgb_to_linear
+
+    iio.imwrite(tmp_path / "grey.png", np.full((4, 8), grey))
+    light = {"type": "envmap", "path": str(tmp_path / "grey.png"), **colorspace}
+    scene = torchpt.load({"camera": {"origin": [0, 0, 1], "target": [0, 0, 0]}, "lights": {"sky": light}}, "cpu")
+    value = torch.tensor(128 / 255.0)
+    expected = srgb_to_linear(value) if decoded else value
     torch.testing.assert_close(scene.params["lights.sky.texels"], expected.expand(4, 8, 3))
 
 
 BAD: dict[str, tuple[dict[str, Any], str]] = {
     "no path": ({}, "lights.sky.path"),
     "scale": ({"scale": -1}, "lights.sky.scale"),
+    "colour space": ({"colorspace": "xyz"}, "lights.sky.colorspace"),
     "squeezed": ({"transform": [{"scale": [1, 2, 1]}]}, "lights.sky.transform"),
     "unknown key": ({"radiance": 1}, "lights.sky.radiance"),
 }

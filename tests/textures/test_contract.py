@@ -69,7 +69,7 @@ ROWS: dict[str, Row] = {
         {"path": "PATH"},
         {(0.5 / 3, 0.25): (0.1, 0.2, 0.3), (1.0 / 3, 0.25): (0.5, 0.35, 0.5), (2.5 / 3, -0.25): (0.8, 0.4, 0.2)},
         {
-            "path": 3, "data": [[1], [2, 3]], "wrap": "around", "filter": "cubic", "colorspace": "xyz",
+            "path": 3, "data": [[1], [2, 3]], "wrap": "around", "filter": "cubic", "colorspace": "xyz", "clamp": 2,
             "scale": "big", "channel": "z", "max_pixels": 0, "uv_transform": {"rotate": "left"},
         },
         {"": 1.01},

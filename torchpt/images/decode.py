@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchpt.core.errors import AssetError
-from torchpt.core.files import as_path, read_regular
+from torchpt.core.files import as_path, is_regular, read_regular
 from torchpt.images.png import sanitize_png
 
 __all__ = ["MAX_PIXELS", "READABLE", "EncodedImage", "Pixels", "decode_image", "existing_image", "oiio_error"]
@@ -93,10 +93,10 @@ def existing_image(path: str | PathLike[str]) -> Path:
 
     Raises:
         SceneError: ``path`` is not a path.
-        AssetError: an unknown ending, no such file, or not a regular file.
+        AssetError: no such file, not a regular file, or one that neither its ending nor its first bytes name.
     """
     path = as_path(path)
-    if path.suffix.lower() not in READABLE:
+    if path.suffix.lower() not in READABLE and not (is_regular(path) and _ending_of(_head(path))):
         raise AssetError(path, f"unknown kind of image {path.suffix!r}; known: {' '.join(READABLE)}")
     try:
         if not path.exists():
@@ -117,7 +117,7 @@ def decode_image(source: Path | EncodedImage, max_pixels: int) -> Pixels:
     label = str(source) if isinstance(source, Path) else source.label
     try:
         data = _head(source)
-        ending = next((ending for magic, ending in _SIGNATURES.items() if data.startswith(magic)), None)
+        ending = _ending_of(data)
         if ending is None:
             ending = source.suffix.lower() if isinstance(source, Path) else f".{source.kind.lower()}"
         if ending not in READABLE:
@@ -140,6 +140,11 @@ def decode_image(source: Path | EncodedImage, max_pixels: int) -> Pixels:
         raise AssetError(label, f"cannot be read ({error.strerror or error})") from None
     except Exception as problem:  # SyntaxError, ValueError, struct.error, zlib.error, text that is no UTF-8, ...
         raise AssetError(label, f"cannot be read ({_first_line(problem)})") from None
+
+
+def _ending_of(head: bytes) -> str | None:
+    """Return the ending of the format that a file's first bytes name, or None."""
+    return next((ending for magic, ending in _SIGNATURES.items() if head.startswith(magic)), None)
 
 
 def _head(source: Path | EncodedImage) -> bytes:

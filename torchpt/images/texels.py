@@ -136,19 +136,21 @@ def texels_from_array(value: Any) -> Texels:
     return Texels(array.copy(), array.dtype == np.uint8, int(np.iinfo(array.dtype).max))
 
 
-def texels_to_radiance(texels: Texels, source: str, key: str) -> NDArray[np.float32]:
-    """Return an image as radiance ``(H, W, 3)``: grey repeated in all channels, 8-bit values decoded from sRGB, alpha dropped.
+def texels_to_radiance(texels: Texels, source: str, key: str, colorspace: str = "auto") -> NDArray[np.float32]:
+    """Return an image as radiance ``(H, W, 3)``: grey repeated in all channels, alpha dropped.
 
     Args:
         texels: the image.
         source: its name for errors.
         key: the scene parameter that refers to it, for errors.
+        colorspace: ``srgb`` decodes whole numbers, ``auto`` those of 8 bits, ``linear`` none.
 
     Raises:
         Refused: a negative value.
     """
     channels = 3 if texels.stored.shape[2] >= 3 else 1
-    values = texels.linear(channels) if texels.eight_bit else texels.values[..., :channels]
+    encoded = texels.eight_bit if colorspace == "auto" else colorspace == "srgb" and texels.white is not None
+    values = texels.linear(channels) if encoded else texels.values[..., :channels]
     if channels == 1:
         values = values.repeat(3, 2)
     if values.min() < 0:

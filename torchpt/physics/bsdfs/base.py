@@ -115,7 +115,7 @@ class Bsdf:
         if values["alpha_cutoff"] is not None and "opacity" not in given:
             raise Refused("an opacity beside alpha_cutoff", values["alpha_cutoff"], ("alpha_cutoff",))
         if values["normal_map"] is not None and values["bump_map"] is not None:
-            raise Refused("either normal_map or bump_map, not both", values["bump_map"], ("bump_map",))
+            raise Refused("either normal_map or bump_map, not both", "both", ("bump_map",))
         for key, scaled in (("normal_strength", "normal_map"), ("emission_strength", "emission")):
             if key in given and values[scaled] is None:
                 raise Refused(f"{'an' if scaled[0] in 'aeiou' else 'a'} {scaled} beside {key}", values[key], (key,))

@@ -85,12 +85,16 @@ class Layers:
     Attributes:
         layers: file and tree of its keys (nested mappings without values), the lowest layer first; the file of overrides is
             None.
+        places: file, line and element of an imported scene that a key and those below it come from, by dotted key.
     """
 
     layers: tuple[tuple[str | None, Any], ...] = field(default=())
+    places: Mapping[str, str] = field(default_factory=dict)
 
     def file_of(self, key: str, otherwise: str | None) -> str | None:
         """Return the file that a key comes from: the last of those that have the longest prefix of it.
+
+        Of an imported scene the place within it is returned.
 
         Args:
             key: dotted key.
@@ -101,11 +105,13 @@ class Layers:
             length = _known_length(tree, key)
             if length >= longest:
                 found, longest = file, length
-        return found
+        if self.layers and found is None:
+            return None
+        return next((self.places[name] for name in prefixes(key) if name in self.places), found)
 
     def blame(self, error: SceneError) -> SceneError:
         """Return the error with the file that its key comes from."""
-        if not self.layers:
+        if not self.layers and not self.places:
             return error
         return type(error)(error.key, error.value, error.expected, self.file_of(error.key, error.file))
 

@@ -203,9 +203,17 @@ def read_description(
     """
     types = material_types(bsdfs)
 
-    def describe(raw: Any, file: str | None, base: Path) -> Description:
-        """Merge the layers of a scene and validate the result; ``base``: the folder that relative paths start from."""
+    def describe(raw: Any, file: str | None, base: Path, origins: Mapping[str, str] | None = None) -> Description:
+        """Merge the layers of a scene and validate the result.
+
+        Args:
+            raw: the scene.
+            file: its file.
+            base: the folder that relative paths start from.
+            origins: see :attr:`Layers.places`.
+        """
         merged, layers = compose(plain(raw, file), file, base, places)
+        layers = replace(layers, places=origins or {})
         if overrides:
             merged, layers = overridden_by(merged, overrides, layers, file, base)
         merged = change(merged) if change is not None else merged
@@ -228,13 +236,13 @@ def read_description(
     if isinstance(source, str) and "\n" in source:
         return describe(parse_yaml(source), file=None, base=Path.cwd())
     if file.endswith(".xml"):
-        from torchpt.scene.formats.mitsuba import read_mitsuba, split_import_keys  # few scenes need it
+        from torchpt.scene.formats.mitsuba import import_mitsuba, split_import_keys  # few scenes need it
 
         path, given = Path(file), overrides
         _check_exists(path, file, places)
         options, overrides = split_import_keys(overrides)
-        raw = read_mitsuba(path, file, options)
-        found = describe(raw, file=file, base=path.resolve().parent)
+        raw, origins = import_mitsuba(path, file, options)
+        found = describe(raw, file, path.resolve().parent, origins)
         return replace(found, overrides=override_words(given or {}), allows_empty_meshes=not options.strict)
     if file.endswith((".yaml", ".yml")):
         path = Path(file)

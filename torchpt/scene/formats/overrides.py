@@ -91,7 +91,7 @@ def overridden_by(
     for change in changes:
         _add_keys(tree, change.parts, change.value)
     below = layers.layers or ((file, skeleton(raw)),)
-    return result, Layers((*below, (None, tree)))
+    return result, Layers((*below, (None, tree)), layers.places)
 
 
 @dataclass

@@ -37,22 +37,24 @@ FORMATS = {
 }
 
 
-def load_mesh(path: Path, *, materials: bool = True, index: int | None = None) -> list[MeshPart]:
+def load_mesh(path: Path, *, materials: bool = True, index: int | None = None, ending: str = "") -> list[MeshPart]:
     """Return the parts of a mesh file, one per material.
 
     Args:
-        path: a file ending in one of ``FORMATS``.
+        path: a file ending in one of ``FORMATS``, or a file of any name where ``ending`` is given.
         materials: True to read the file's own materials (MTL files, glTF materials).
         index: number of the one mesh to be read of a ``.serialized`` file; None: all.
+        ending: the ending of the format that the file is read as; by default the file's own.
 
     Raises:
         AssetError: the file cannot be read or is malformed; the message names the element. Or an index for another format.
     """
     path = Path(path)
-    format_name = FORMATS.get(path.suffix.lower())
+    ending = ending or path.suffix.lower()
+    format_name = FORMATS.get(ending)
     if format_name is None:
-        raise AssetError(path, f"expected a mesh file ending in {', '.join(FORMATS)}, got {path.suffix or 'no ending'}")
-    if index is not None and path.suffix.lower() != SERIALIZED:
+        raise AssetError(path, f"expected a mesh file ending in {', '.join(FORMATS)}, got {ending or 'no ending'}")
+    if index is not None and ending != SERIALIZED:
         raise AssetError(path, f"has no meshes by number, as {SERIALIZED} files have; shape_index {index} is asked for")
     try:
         if index is not None:

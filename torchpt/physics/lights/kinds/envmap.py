@@ -36,7 +36,7 @@ from torchpt.math.vectors import azimuth, dot, luminance, safe_reciprocal, take
 from torchpt.physics.ibl.equirect import Cell, angles
 from torchpt.physics.lights.base import Environment, EnvironmentImage, Row, Setting, bright
 from torchpt.physics.lights.records import Lights, LightSample
-from torchpt.spec import Custom, Moves, Path, Pose, Scalar, Spec, Texels
+from torchpt.spec import Choice, Custom, Moves, Path, Pose, Scalar, Spec, Texels
 
 if TYPE_CHECKING:
     import numpy as np
@@ -306,12 +306,17 @@ class Envmap(Environment):
 
     name = "envmap"
     parameters: ClassVar = {
-        "path": Path(None, doc="image file: `.exr`, `.hdr` or 8-bit; of several paths the first that exists"),
+        "path": Path(None, doc="image file; of several paths the first that exists"),
         "data": Custom(
             None,
             reader=texels_from_array,
             words=ACCEPTED_TEXELS,
-            doc="array, tensor or rows of numbers in place of a file, the top row first; linear, except uint8 (sRGB)",
+            doc="array, tensor or rows of numbers in place of a file, the top row first; linear, except uint8: `colorspace`",
+        ),
+        "colorspace": Choice(
+            "auto",
+            names=("auto", "srgb", "linear"),
+            doc="encoding of images of whole numbers; auto: sRGB for those of 8 bits a value, else linear",
         ),
         "scale": Scalar(1.0, doc="factor of the radiance"),
         "transform": Pose(
@@ -333,10 +338,11 @@ class Envmap(Environment):
     ) -> dict[str, tuple[NDArray[np.float32], Spec]]:
         """See :meth:`Light.files`."""
         spec = Texels(doc="radiance `(H, W, 3)`, before `scale`")
+        space = values["colorspace"]
         if values["data"] is not None:
-            return {"texels": (texels_to_radiance(values["data"], "data", "data"), spec)}
+            return {"texels": (texels_to_radiance(values["data"], "data", "data", space), spec)}
         file = find("path")
-        return {"texels": (texels_to_radiance(read_texels(file), str(file), "path"), spec)}
+        return {"texels": (texels_to_radiance(read_texels(file), str(file), "path", space), spec)}
 
     @classmethod
     def row(cls, scene: Setting) -> Row:

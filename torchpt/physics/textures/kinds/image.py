@@ -11,6 +11,8 @@ from functools import partial
 from pathlib import Path as FilePath
 from typing import Any, ClassVar
 
+import numpy as np
+
 from torchpt.core.errors import AssetError, SceneError
 from torchpt.core.threads import ReadAhead
 from torchpt.images import EncodedImage, Texels, read_texels
@@ -18,7 +20,7 @@ from torchpt.images.decode import MAX_PIXELS
 from torchpt.images.texels import ACCEPTED_TEXELS, check_source, texels_from_array
 from torchpt.physics.textures.atlas import WRAPS, ImageNode
 from torchpt.physics.textures.base import CHANNELS, Find, Mapped, Node, Opening, TextureInput
-from torchpt.spec import Choice, Color, Custom, Integer, Path, Refused
+from torchpt.spec import Choice, Color, Custom, Flag, Integer, Path, Refused
 from torchpt.spec import Texels as TexelsSpec
 
 __all__ = ["MOST_PIXELS", "Image"]
@@ -61,6 +63,7 @@ class Image(Mapped):
             doc="encoding of images of whole numbers; auto: sRGB for a colour of 8 bits a value, else linear",
         ),
         "scale": Color((1.0, 1.0, 1.0), low=None, doc="factor of the values"),
+        "clamp": Flag(False, doc="whether values that are outside of 0..1 after `scale` become 0 or 1"),
         "channel": Choice(None, names=CHANNELS, doc="channel for a number; luminance by default"),
         "max_pixels": Integer(
             None, low=1, high=MOST_PIXELS, also=(None,), doc="larger images are refused; null: 64 Mpixel"
@@ -115,6 +118,8 @@ class Image(Mapped):
         if not slot.coloured and len(set(scale)) > 1:
             expected = f"one number, as {opening.key} is one"
             raise SceneError(f"{opening.name}.scale", list(scale), expected, opening.file)
+        if values["clamp"]:
+            picture, decode = _clamped(picture, label, scale, opening, decode=decode), False
         name = _declare_texels(opening, label, picture, scale, decode=decode, alpha=alpha)
         index = None
         if not slot.coloured:  # the channel's index among the texels; -1: luminance
@@ -153,6 +158,18 @@ def _read_image(values: Mapping[str, Any], opening: Opening) -> tuple[str, Texel
         begun = opening.image_cache.pop((label, max_pixels), None)  # see `Image.read_ahead`
         picture = opening.image_cache[label] = read_texels(source, max_pixels) if begun is None else begun()
     return label, picture
+
+
+def _clamped(
+    picture: Texels, label: str, scale: tuple[float, float, float], opening: Opening, *, decode: bool
+) -> Texels:
+    """Return an image whose values are in 0..1 after ``scale``; arguments as for :func:`_declare_texels`."""
+    key = ("clamped", label, scale, decode)
+    if key not in opening.image_cache:
+        values = picture.decoded if decode else picture.values
+        high = 1.0 / max(*map(abs, scale), 1e-30)
+        opening.image_cache[key] = Texels(np.clip(values, 0.0, np.float32(high)), eight_bit=False)
+    return opening.image_cache[key]
 
 
 def _is_encoded(picture: Texels, colorspace: str, *, linear: bool) -> bool:

@@ -9,6 +9,6 @@ A :class:`~.plugins.Plugin` of a table says whether its twin is exact, the neare
 the table has to change where an exact twin is written later. ``docs/mitsuba.md`` has these tables.
 """
 
-from torchpt.scene.formats.mitsuba.importer import ImportOptions, read_mitsuba, split_import_keys
+from torchpt.scene.formats.mitsuba.importer import ImportOptions, import_mitsuba, read_mitsuba, split_import_keys
 
-__all__ = ["ImportOptions", "read_mitsuba", "split_import_keys"]
+__all__ = ["ImportOptions", "import_mitsuba", "read_mitsuba", "split_import_keys"]

@@ -18,7 +18,7 @@ from torchpt.scene.formats.mitsuba.textures import scaled
 if TYPE_CHECKING:
     from torchpt.scene.formats.mitsuba.importer import Importer
 
-__all__ = ["BSDFS", "UNKNOWN"]
+__all__ = ["BSDFS", "UNKNOWN", "opacity_of"]
 
 Material = dict[str, Any]
 
@@ -99,6 +99,9 @@ def _alphas(p: Properties) -> Material:
     """Return the distribution of facets and their roughness, for two directions where they are given."""
     found: Material = {"distribution": _distribution(p)}
     if p.has("alpha_u", "alpha_v"):
+        for one, other in (("alpha_u", "alpha_v"), ("alpha_v", "alpha_u")):
+            if not p.has(one):
+                p.note(f"{other} without {one}, which becomes 0.1")
         return found | {key: p.scalar(key, 0.1) for key in ("alpha_u", "alpha_v")}
     return found | {"alpha": p.scalar("alpha", 0.1)}
 
@@ -183,7 +186,7 @@ def _twosided(p: Properties, importer: Importer) -> Material:
     inner = p.objects("bsdf")
     if not 1 <= len(inner) <= 2:
         raise p.element.error(p.element.label, f"one or two bsdf inside it, not {len(inner)}")
-    if len(inner) == 2:
+    if len(inner) == 2 and inner[0] is not inner[1]:
         p.note("the second bsdf, of the back, is left out: the first has both sides")
     material = dict(importer.material(inner[0]))
     material.pop("two_sided", None)
@@ -207,7 +210,7 @@ def _blend(p: Properties, importer: Importer) -> Material:
     if len(inner) != 2:
         raise p.element.error(p.element.label, f"two bsdf inside it, not {len(inner)}")
     textures = [] if p.has("weight") else p.objects("texture")
-    weight = importer.texture(textures[0]) if textures else p.scalar("weight", 0.5)
+    weight = p.fraction(importer.texture(textures[0]), "weight") if textures else p.scalar("weight", 0.5)
     if isinstance(weight, list):
         weight = weight[0]
     return _blended([importer.material(element) for element in inner], weight, p)
@@ -265,6 +268,23 @@ def _passes(material: Material) -> bool:
     )
 
 
+def opacity_of(material: Material) -> float | None:
+    """Return the share of light that a material does not let straight through; None where a texture gives it."""
+    found = material.get("opacity", 1.0)
+    if material["type"] == "null":
+        found = 0.0
+    elif material["type"] == "blend":
+        a, b, weight = opacity_of(material["a"]), opacity_of(material["b"]), material["weight"]
+        if a == b == 1.0:
+            inner = 1.0
+        elif a is None or b is None or isinstance(weight, dict):
+            return None
+        else:
+            inner = a + (b - a) * weight
+        return None if isinstance(found, dict) else found * inner
+    return None if isinstance(found, dict) else float(found)
+
+
 def _mixture(p: Properties, importer: Importer) -> Material:
     inner = [importer.material(element) for element in p.objects("bsdf")]
     text = p.text("weights")
@@ -311,8 +331,11 @@ def _mapped(p: Properties, importer: Importer, key: str) -> Material:
     if isinstance(value, list):
         p.note("a constant map is left out")
         return material
-    if key in material:
-        p.note(f"the {key} of the bsdf inside is left out")
+    if key == "normal_map":
+        value = p.fraction(value, "normals")
+    for other in _OUTER:
+        if material.pop(other, None) is not None:
+            p.note(f"the {other} of the bsdf inside is left out")
     if scale != 1.0:
         value = scaled(value, [scale] * 3, p)
     return material | {key: value}
@@ -389,7 +412,7 @@ BSDFS: dict[str, Plugin] = {
     "plastic": exact("plastic", _plastic),
     "roughplastic": exact("roughplastic", _rough_plastic, "phong becomes beckmann, with a warning; alpha is a number"),
     "principled": exact("principled", _principled),
-    "twosided": exact("two_sided", _twosided, "one bsdf for both sides"),
+    "twosided": exact("two_sided", _twosided, "two bsdf: nearest, the first has both sides, with a warning"),
     "mask": exact("opacity", _mask),
     "blendbsdf": exact("blend", _blend, "maps and opacity textures inside are left out, with a warning"),
     "mixturebsdf": exact("blend", _mixture, "as blendbsdf"),

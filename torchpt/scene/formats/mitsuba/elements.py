@@ -67,9 +67,18 @@ class Element:
         """Return the element as warnings name it: ``bsdf "coating"``."""
         return f'{self.tag} "{self.type}"' if self.type else self.tag
 
+    @property
+    def place(self) -> str:
+        """Return file, line and element as errors name them."""
+        return f"{self.file}: {self._line}"
+
+    @property
+    def _line(self) -> str:
+        return f"line {self.line}, {self.label} {self.attributes.get('name', '')}".rstrip()
+
     def error(self, value: object, expected: str) -> SceneError:
         """Return the error of a wrong value in this element."""
-        return SceneError(f"line {self.line}", value, expected, self.file)
+        return SceneError(self._line, value, expected, self.file)
 
 
 def parse_scene(

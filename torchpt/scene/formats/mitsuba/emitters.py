@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchpt.math.transforms import similarity_scale
 from torchpt.physics.lights.sun_position import sun_angles
 from torchpt.scene.formats.mitsuba.plugins import Plugin, exact, left_out, nearest
 from torchpt.scene.formats.mitsuba.properties import Properties
@@ -26,6 +25,7 @@ Matrix = NDArray[np.float64]
 
 _ONE = [1.0, 1.0, 1.0]
 _NARROWEST = 1e-6  # beam of a spot, of its cutoff
+_SCALED = 1e-3  # a scale nearer to 1 is rounding of a rotation
 
 
 def _common(p: Properties) -> None:
@@ -56,6 +56,7 @@ def _point(p: Properties, importer: Importer) -> list[Light]:
 def _spot(p: Properties, importer: Importer) -> list[Light]:
     _common(p)
     matrix = p.transform()
+    _turn(p)
     intensity, cutoff = p.colour("intensity", _ONE, light=True), p.number("cutoff_angle", 20.0)
     beam = p.number("beam_width", 0.75 * cutoff)
     if p.objects("texture"):
@@ -89,12 +90,12 @@ def _constant(p: Properties, importer: Importer) -> list[Light]:
 def _envmap(p: Properties, importer: Importer) -> list[Light]:
     _common(p)
     p.ignore("mis_compensation", "cache")
-    path, scale, matrix = p.file(), p.number("scale", 1.0), p.transform()
+    path, scale, matrix = p.file(), p.number("scale", 1.0), _turn(p)
     if p.number("gamma", -1.0) not in (-1.0, 0.0):
         p.note("gamma is left out")
     if path is None:
         return [{"type": "constant", "radiance": [0.5 * scale] * 3}]
-    found: Light = {"type": "envmap", "path": importer.path(path)}
+    found: Light = {"type": "envmap", "path": importer.path(path), "colorspace": "srgb"}
     if scale != 1.0:
         found["scale"] = scale
     if not np.array_equal(matrix, np.eye(4)):
@@ -154,13 +155,21 @@ def _within(p: Properties, name: str, default: float, low: float, high: float) -
 
 def _upright(p: Properties) -> Matrix:
     """Return the transform ``(4, 4)`` of a sky whose up is +y; in files of Mitsuba 2 and 3 it is +z."""
-    pose = np.eye(4)
-    linear = p.transform()[:3, :3]
-    if similarity_scale(p.transform()) is None:
-        p.note("a to_world that keeps no angles is left out")
-    else:
-        pose[:3, :3] = linear / abs(np.linalg.det(linear)) ** (1.0 / 3.0)
+    pose = _turn(p)
     return pose @ _Z_UP if p.modern else pose
+
+
+def _turn(p: Properties) -> Matrix:
+    """Return the rotation ``(4, 4)`` of ``to_world``, which may mirror; note a scale, by which Mitsuba's picture differs."""
+    pose = np.eye(4)
+    u, scales, v = np.linalg.svd(p.transform()[:3, :3])
+    if not np.allclose(scales, 1.0, atol=_SCALED):
+        p.note(
+            "the scale of to_world is left out; Mitsuba's directions are not of length 1 then, and its picture differs"
+        )
+    if scales[1] > 0.0:
+        pose[:3, :3] = u @ v
+    return pose
 
 
 #: Turns +y to +z.

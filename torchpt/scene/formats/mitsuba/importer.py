@@ -13,13 +13,14 @@ import numpy as np
 
 from torchpt.core.errors import AssetError, SceneError, did_you_mean
 from torchpt.core.files import is_regular
+from torchpt.images.texels import read_texels
 from torchpt.math.transforms import is_usable
-from torchpt.scene.formats.mitsuba.bsdfs import BSDFS, UNKNOWN
+from torchpt.scene.formats.mitsuba.bsdfs import BSDFS, UNKNOWN, opacity_of
 from torchpt.scene.formats.mitsuba.elements import Element, parse_scene, walk
 from torchpt.scene.formats.mitsuba.emitters import EMITTERS, join_skies
 from torchpt.scene.formats.mitsuba.notes import Notes
 from torchpt.scene.formats.mitsuba.plugins import Plugin, Twin, left_out, nearest
-from torchpt.scene.formats.mitsuba.properties import OBJECTS, VALUES, Properties
+from torchpt.scene.formats.mitsuba.properties import OBJECTS, VALUES, Properties, note_unknown_parts
 from torchpt.scene.formats.mitsuba.sensors import (
     FILMS,
     FILTERS,
@@ -31,10 +32,10 @@ from torchpt.scene.formats.mitsuba.sensors import (
     UNKNOWN_SAMPLER,
 )
 from torchpt.scene.formats.mitsuba.shapes import SHAPES, bounds, posed, with_attribute
-from torchpt.scene.formats.mitsuba.textures import TEXTURES, attributes_of
-from torchpt.scene.formats.mitsuba.versions import plugin_name
+from torchpt.scene.formats.mitsuba.textures import TEXTURES, attributes_of, scaled
+from torchpt.scene.formats.mitsuba.versions import plugin_name, property_name
 
-__all__ = ["PLUGINS", "ImportOptions", "Importer", "read_mitsuba", "split_import_keys"]
+__all__ = ["PLUGINS", "ImportOptions", "Importer", "import_mitsuba", "read_mitsuba", "split_import_keys"]
 
 #: The tables of plugins by tag.
 PLUGINS: dict[str, Mapping[str, Plugin]] = {
@@ -122,6 +123,11 @@ def _as_text(key: str, value: Any) -> str:
 
 
 def read_mitsuba(path: Path, file: str, options: ImportOptions) -> dict[str, Any]:
+    """Read a scene of Mitsuba; see :func:`import_mitsuba`."""
+    return import_mitsuba(path, file, options)[0]
+
+
+def import_mitsuba(path: Path, file: str, options: ImportOptions) -> tuple[dict[str, Any], dict[str, str]]:
     """Read a scene of Mitsuba.
 
     Args:
@@ -131,7 +137,7 @@ def read_mitsuba(path: Path, file: str, options: ImportOptions) -> dict[str, Any
 
     Returns:
         The scene in the form of a YAML file; relative paths start at the file's folder. Shapes may have ``mesh`` in place of
-        ``path``: parts that are not as the file has them.
+        ``path``: parts that are not as the file has them. And where its keys come from, by dotted key: file, line and element.
 
     Raises:
         SceneError: a scene that cannot be read, with its line; a missing file; any warning where the import is strict.
@@ -143,7 +149,7 @@ def read_mitsuba(path: Path, file: str, options: ImportOptions) -> dict[str, Any
     importer = Importer(root, path.resolve().parent, options, left_out)
     scene = importer.scene()
     importer.notes.warn()
-    return scene
+    return scene, importer.places
 
 
 class Importer:
@@ -155,6 +161,7 @@ class Importer:
         textures: named textures that something uses, by name.
         shapes: shapes by name.
         lights: lights by name.
+        places: file, line and element that keys of the scene come from, by dotted key.
     """
 
     def __init__(self, root: Element, base: Path, options: ImportOptions, left_out: Sequence[Element]) -> None:
@@ -164,11 +171,14 @@ class Importer:
         self.textures: dict[str, Any] = {}
         self.shapes: dict[str, Any] = {}
         self.lights: dict[str, Any] = {}
+        self.places: dict[str, str] = {}
         self._meshes_of_groups: dict[int, dict[int, str]] = {}  # by id of a group: shape drawn, by id of its element
         self._depth = 0
         self._folders = [base]
         self._ids: dict[str, Element] = {}
+        self._keys: dict[str, str] = {}  # key of a material or a texture, by its id
         self._find_ids()
+        note_unknown_parts(root, self.notes)
         if left_out:
             self._leave_out(left_out)
 
@@ -216,6 +226,14 @@ class Importer:
             SceneError: nothing has this id.
         """
         return self._with_id(reference.attributes.get("id", ""), reference)
+
+    def locate(self, key: str, element: Element) -> None:
+        """Keep where a key of the scene comes from, and those below it that the element's properties give."""
+        self.places[key] = element.place
+        for child in element.children:
+            name = property_name(element.tag, plugin_name(element.tag, element.type), child.attributes.get("name", ""))
+            if name and child.tag in VALUES:
+                self.places[f"{key}.{name}"] = f"{child.file}: line {child.line}, {element.label} {name}"
 
     # ---- Files
 
@@ -279,20 +297,42 @@ class Importer:
         """Return the material of a ``<bsdf>``."""
         if element.tag != "bsdf":
             raise element.error(f"<{element.written}>", "a bsdf")
-        if element.id and _key(element.id) in self.materials:
-            return self.materials[_key(element.id)]
+        if self._keys.get(element.id) in self.materials:
+            return self.materials[self._keys[element.id]]
         return self.build(BSDFS, element, UNKNOWN)
 
     def texture(self, element: Element) -> Any:
         """Return a texture for a parameter: a reference to a named one, one in place, or a colour."""
-        name = _key(element.id)
-        if element.id and name in self.textures:
-            return {"texture": name}
+        if self._keys.get(element.id) in self.textures:
+            return {"texture": self._keys[element.id]}
         value = self.build(TEXTURES, element, _UNKNOWN_TEXTURE)
         if not element.id or not isinstance(value, dict) or "texture" in value:
             return value
+        name = self._key(self.textures, element)
         self.textures[name] = value
+        self.locate(f"textures.{name}", element)
         return {"texture": name}
+
+    def exceeds_one(self, texture: Mapping[str, Any]) -> bool:
+        """Return True for a texture with values outside of 0..1: images of floats are read to see."""
+        if texture["type"] != "image":
+            return max((*texture.get("color0", ()), *texture.get("color1", ()), 0.0)) > 1.0
+        scale = max(map(abs, texture.get("scale", (1.0,))))
+        path = self.base / texture["path"]
+        if scale <= 1.0 and path.suffix.lower() in _WHOLE:
+            return False
+        try:
+            picture = read_texels(path)
+        except AssetError:
+            return False  # refused when the scene is built, with more words
+        values = picture.decoded if texture["colorspace"] == "srgb" and picture.white is not None else picture.values
+        return bool(values.min() < 0.0 or values.max() * scale > 1.0 + 1e-6)
+
+    def _key(self, taken: Mapping[str, Any], element: Element) -> str:
+        """Return the key of a material or a texture that has an id; ids that make the same key get one each."""
+        if element.id not in self._keys:
+            self._keys[element.id] = self._free(taken, element)
+        return self._keys[element.id]
 
     # ---- The scene
 
@@ -331,12 +371,21 @@ class Importer:
         for child in sensor.children:
             target = self.target(child) if child.tag == "ref" else child
             if target.tag in ("film", "sampler"):
+                if target.tag in inner:
+                    self.notes.add(target, f"{sensor.label}: only the last {target.tag} of several is taken")
                 inner[target.tag] = target
             else:
                 rest.append(child)
         bare = replace(sensor, children=rest)
         camera = self.build(SENSORS, bare, _UNKNOWN_SENSOR) if sensors else {}
         film = {"width": 768, "height": 576, "filter": {"type": "gaussian"}}
+        self.locate("camera", sensor)
+        for key, tag in (("film", "film"), ("sampler", "sampler"), ("render.spp", "sampler")):
+            if tag in inner:
+                self.locate(key, inner[tag])
+        for child in inner["film"].children if "film" in inner else ():
+            if child.tag == "rfilter":
+                self.locate("film.filter", child)
         if "film" in inner:
             film = self.build(FILMS, inner["film"], UNKNOWN_FILM)
         sampler, count = "independent", 4
@@ -345,8 +394,11 @@ class Importer:
         integrator: dict[str, Any] = {"type": "path", "max_depth": -1}
         if self.root.version < (2,):  # without one, Mitsuba took direct light
             integrator = {"type": "direct"}
+        if len(integrators) > 1:
+            self.notes.add(integrators[-1], "all integrators but the last are left out")
         if integrators:
             integrator = self.build(INTEGRATORS, integrators[-1], UNKNOWN_INTEGRATOR)
+            self.locate("integrator", integrators[-1])
         layers = integrator.pop("aovs", [])
         if integrator["type"] != "aov":
             integrator = integrator | {"dark_rims": True}
@@ -389,7 +441,17 @@ class Importer:
             return
         shape = self._plain_shape(element)
         if shape is not None:
-            self.shapes[self._free(self.shapes, element)] = shape
+            self._add_shape(element, shape)
+
+    def _add_shape(self, element: Element, shape: dict[str, Any]) -> str:
+        """Add a shape to the scene; return its name."""
+        name = self._free(self.shapes, element)
+        self.shapes[name] = shape
+        self.locate(f"shapes.{name}", element)
+        for child in element.children:
+            if child.tag == "bsdf":
+                self.locate(f"shapes.{name}.material", child)
+        return name
 
     def _merge(self, element: Element) -> None:
         """Add the shapes of a ``merge``, which keep their own materials."""
@@ -415,7 +477,7 @@ class Importer:
         border = has_medium and emitter is None and element.version < (2,)
         material, name = self._material_of(inner.get("bsdf"), lit=emitter is not None, border=border)
         if emitter is not None:
-            radiance = self._radiance(emitter)
+            radiance = self._radiance(emitter, opacity_of(material))
             if isinstance(radiance, dict):
                 material, name = {**material, "emission": radiance}, None
             elif radiance is not None:
@@ -455,12 +517,18 @@ class Importer:
         material = self.material(element)
         if not element.id:
             return material, None
-        name = _key(element.id)
+        name = self._key(self.materials, element)
         self.materials[name] = material
+        self.locate(f"materials.{name}", element)
         return material, name
 
-    def _radiance(self, element: Element) -> Any:
-        """Return the radiance of an area emitter: a colour or a texture; None where the emitter is left out."""
+    def _radiance(self, element: Element, opacity: float | None) -> Any:
+        """Return the radiance of an area emitter: a colour or a texture; None where the emitter is left out.
+
+        Args:
+            element: the emitter.
+            opacity: that of its shape, which Mitsuba's emission does not depend on and ours is multiplied by; None: a texture.
+        """
         name = plugin_name(element.tag, element.type)
         if name != "area":
             self.notes.add(element, f"{element.label} on a shape is left out: only area emitters are on shapes")
@@ -469,6 +537,12 @@ class Importer:
         properties.ignore("sampling_weight")
         found = properties.slot("radiance", [1.0] * 3, light=True)
         properties.left_over()
+        if opacity is None:
+            properties.note("emission is multiplied by the opacity of the shape, a texture, where Mitsuba's is not")
+        elif not opacity > 0.0:
+            properties.note("it is left out: its shape is not there (null, or an opacity of 0), where Mitsuba's shines")
+        elif opacity != 1.0:
+            found = scaled(found, [1.0 / opacity] * 3, properties)
         return found
 
     def _instance(self, element: Element) -> None:
@@ -495,9 +569,7 @@ class Importer:
             before = self.shapes.get(drawn.get(id(target), ""))
             shape = self._plain_shape(target) if before is None or before["type"] != "mesh" else None
             if shape is not None:
-                name = self._free(self.shapes, target)
-                self.shapes[name] = posed(shape, pose)
-                drawn[id(target)] = name
+                drawn[id(target)] = self._add_shape(target, posed(shape, pose))
             elif before is not None:
                 total = pose @ self._own_pose(target)
                 if not is_usable(total):
@@ -505,7 +577,7 @@ class Importer:
                     continue
                 sides = {"flip_normals": True} if before.get("flip_normals") else {}  # a copy has its own
                 copy = posed({"type": "instance", "of": drawn[id(target)], **sides}, total)
-                self.shapes[self._free(self.shapes, target)] = copy
+                self._add_shape(target, copy)
 
     def _own_pose(self, element: Element) -> Any:
         """Return the transform of a shape of a group."""
@@ -516,6 +588,8 @@ class Importer:
     def _emitter(self, element: Element) -> None:
         """Add a light that is on no shape."""
         if plugin_name(element.tag, element.type) == "area":
+            if self._is_on_a_shape(element):
+                return
             self.notes.add(element, f"{element.label} is left out: it is on no shape")
             return
         for light in self.build(EMITTERS, element, _UNKNOWN) or ():
@@ -525,11 +599,18 @@ class Importer:
                     continue
                 self.notes.add(element, f"{element.label} is left out: there is an environment before it")
                 continue
-            self.lights[self._free(self.lights, element, light["type"])] = light
+            name = self._free(self.lights, element, light["type"])
+            self.lights[name] = light
+            self.locate(f"lights.{name}", element)
+
+    def _is_on_a_shape(self, emitter: Element) -> bool:
+        """Return True for an emitter to which a ``<ref>`` in a shape leads."""
+        references = (child for shape in walk(self.root) if shape.tag == "shape" for child in shape.children)
+        return any(child.tag == "ref" and self.target(child) is emitter for child in references)
 
     def _free(self, taken: Mapping[str, Any], element: Element, kind: str = "") -> str:
         """Return a name that is not taken: the id of an element, else its type and a number."""
-        stem = _key(element.id) if element.id else kind or element.type
+        stem = _as_key(element.id) if element.id else kind or element.type
         if element.id and stem not in taken:
             return stem
         number = len(taken) + 1
@@ -538,10 +619,11 @@ class Importer:
         return f"{stem}_{number}"
 
 
+_WHOLE = (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".ppm", ".pgm")  # images of whole numbers, which are at most 1
 _ENVIRONMENTS = ("envmap", "constant", "sky")
 
 
-def _key(name: str) -> str:
+def _as_key(name: str) -> str:
     """Return an id as a key of a scene file."""
     found = "".join(letter if letter.isprintable() else "_" for letter in name).strip()[:200]
     return found or "_"

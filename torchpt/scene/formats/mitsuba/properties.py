@@ -5,18 +5,18 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from torchpt.math.vectors import luminance
+from torchpt.core.errors import did_you_mean
 from torchpt.scene.formats.mitsuba import values
-from torchpt.scene.formats.mitsuba.elements import Element
+from torchpt.scene.formats.mitsuba.elements import Element, walk
+from torchpt.scene.formats.mitsuba.notes import Notes
 from torchpt.scene.formats.mitsuba.versions import property_name
 
 if TYPE_CHECKING:
     from torchpt.scene.formats.mitsuba.importer import Importer
 
-__all__ = ["OBJECTS", "VALUES", "Properties"]
+__all__ = ["OBJECTS", "VALUES", "Properties", "note_unknown_parts"]
 
 #: Tags of objects, which have a plugin; all other tags are values.
 OBJECTS = (
@@ -25,6 +25,61 @@ OBJECTS = (
 )  # fmt: skip
 _COLOURS = ("rgb", "srgb", "spectrum", "blackbody", "color", "float", "integer")
 VALUES = (*_COLOURS, "boolean", "string", "point", "vector", "transform", "animation")
+
+_POINT = ("x", "y", "z", "value")
+_SPECTRUM = (
+    "type",
+    "value",
+    "values",
+    "wavelengths",
+    "wavelength_min",
+    "wavelength_max",
+    "filename",
+    "color",
+    "scale",
+    "intent",
+)
+#: Attributes by tag, without ``name``, which every value may have.
+_ATTRIBUTES: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(OBJECTS, ("type", "id")),
+    **dict.fromkeys((*_COLOURS, "boolean", "string"), ("value", "intent")),
+    **dict.fromkeys(("point", "vector"), _POINT),
+    "spectrum": (*_SPECTRUM, "temperature", "multiplier"),
+    "blackbody": ("temperature", "scale", "multiplier"),
+    "transform": ("time",),
+    "animation": (),
+    "ref": ("id",),
+}
+_OPERATIONS: dict[str, tuple[str, ...]] = {
+    "translate": _POINT,
+    "scale": _POINT,
+    "rotate": (*_POINT, "angle"),
+    "matrix": ("value",),
+    "lookat": ("origin", "target", "up", *(letter + axis for letter in "otu" for axis in "xyz")),
+}
+#: Values with elements inside.
+_CONTAINERS = ("transform", "animation", "spectrum", "blackbody")
+
+
+def note_unknown_parts(root: Element, notes: Notes) -> None:
+    """Warn of attributes that nobody reads and of elements inside plain values, which have none."""
+    for element in walk(root):
+        if element.tag in _OPERATIONS:
+            known = _OPERATIONS[element.tag]
+        elif element.tag in _ATTRIBUTES:
+            known = (*_ATTRIBUTES[element.tag], "name")
+        else:
+            continue
+        name = element.attributes.get("name", "") if element.tag in VALUES else ""
+        place = f"{element.label} {name}".rstrip()
+        for key in element.attributes:
+            if key not in known:
+                notes.add(
+                    element, f"{place}: the attribute {key} is unknown here and left out{did_you_mean(key, known)}"
+                )
+        if element.tag not in OBJECTS and element.tag not in _CONTAINERS:
+            for child in element.children:
+                notes.add(child, f"{place}: the {child.label} inside is left out")
 
 
 class Properties:
@@ -140,7 +195,8 @@ class Properties:
         """
         texture = self._texture(name)
         if texture is not None:
-            return self.importer.texture(texture)
+            found = self.importer.texture(texture)
+            return self.fraction(found, name) if bounded and not light else found
         element = self._value(name)
         if element is None:
             return default
@@ -154,14 +210,29 @@ class Properties:
         return list(found)
 
     def scalar(self, name: str, default: Any = None, *, high: float = 1.0) -> Any:
-        """Return a number in 0..``high`` or a texture, or ``default``; numbers outside are clamped, with a warning."""
+        """Return a number in 0..``high`` or a texture, or ``default``; numbers outside are clamped, with a warning.
+
+        Of a colour the mean is taken, as in Mitsuba.
+        """
         found = self.slot(name, None, bounded=False)
         if found is None or isinstance(found, dict):
-            return default if found is None else found
-        value = found[0] if len(set(found)) == 1 else float(luminance(torch.tensor(found, dtype=torch.float64)))
+            return default if found is None else self.fraction(found, name) if high == 1.0 else found
+        value = found[0] if len(set(found)) == 1 else sum(found) / 3.0
         if value > high:
             self.note(f"{name} above {high:g} becomes {high:g}")
         return min(value, high)
+
+    def fraction(self, value: Any, name: str) -> Any:
+        """Return a texture, or a colour in place of one, as one of values in 0..1; note where it has others."""
+        texture = self.importer.textures[value["texture"]] if isinstance(value, dict) and "texture" in value else value
+        if not (max(value) > 1.0 if isinstance(value, list) else self.importer.exceeds_one(texture)):
+            return value
+        self.note(f"values of the texture of {name} outside of 0..1 are clamped")
+        if isinstance(value, list):
+            return [min(x, 1.0) for x in value]
+        if texture["type"] == "image":
+            return texture | {"clamp": True}
+        return texture | {key: [min(x, 1.0) for x in texture[key]] for key in ("color0", "color1") if key in texture}
 
     def objects(self, *tags: str) -> list[Element]:
         """Return the objects of some tags, in the order of the file."""

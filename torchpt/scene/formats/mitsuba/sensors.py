@@ -119,7 +119,8 @@ def _orthographic(p: Properties, importer: Importer) -> Block:
     if abs(lengths[0] - lengths[1]) > 1e-6 * lengths[0]:
         p.note("pixels are squares: the vertical scale of to_world becomes the horizontal one")
     for name in ("principal_point_offset_x", "principal_point_offset_y"):
-        p.number(name, 0.0)
+        if p.number(name, 0.0):
+            p.note(f"{name} is left out: the middle of the view is that of the film")
     return {"type": "orthographic", "to_world": pose, "width": 2.0 * float(lengths[0])}
 
 
@@ -270,9 +271,24 @@ def _direct(p: Properties, importer: Importer) -> Block:
     return {"type": "direct"}
 
 
+#: Settings of the integrators that become another one, in any version and in published scenes, without meaning for that.
+_SETTINGS = (
+    "alpha", "bidirectional", "bidirectional_mutation", "block_size", "brute_force", "caustic_lookup_radius",
+    "caustic_perturbation", "caustic_photons", "chain_length", "clamp_neighbor", "clamp_screen", "clamping", "debug",
+    "direct_samples", "direct_sampling", "dual_buffer", "explicit_sampling", "global_lookup_radius", "global_photons",
+    "glossy_samples", "gradients", "granularity", "guiding", "guiding_proj", "guiding_rounds", "indirect_only",
+    "initial_radius", "k_nn", "lambda", "lens_perturbation", "light_image", "lookup_size", "luminance_samples",
+    "manifold_perturbation", "max_chains", "max_error", "max_passes", "max_sample_factor", "meridian_align",
+    "multi_chain_perturbation", "num_chains", "overture", "p_large", "p_value", "photon_count", "proj_seed", "quality",
+    "quality_adjustment", "rays", "resolution", "sample_direct", "samples_per_pass", "separate_direct",
+    "shadow_map_resolution", "sppc", "sppi", "sppp", "step_snapshot", "timeout", "two_stage", "use_spectral_mis",
+    "volume_lookup_radius", "volume_photons",
+)  # fmt: skip
+
+
 def _like_path(p: Properties, importer: Importer) -> Block:
     """Return a path tracer in place of an integrator whose own settings have no meaning for it."""
-    p.ignore(*p.names)
+    p.ignore(*_SETTINGS)
     inner = p.objects("integrator")
     if inner:
         return importer.build(INTEGRATORS, inner[0], UNKNOWN_INTEGRATOR)

@@ -11,13 +11,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchpt.core.errors import AssetError, SceneError
+from torchpt.core.errors import AssetError
 from torchpt.math.transforms import affine, apply_points, is_usable, similarity_scale
 from torchpt.math.vectors import Frame
 from torchpt.physics.shapes import KINDS
 from torchpt.scene.formats.mitsuba.elements import Element
 from torchpt.scene.formats.mitsuba.plugins import Plugin, exact, left_out
 from torchpt.scene.formats.mitsuba.properties import Properties
+from torchpt.scene.formats.mitsuba.versions import plugin_name, property_name
 from torchpt.scene.meshes import MeshPart, load_mesh
 from torchpt.scene.meshes.ply import load_ply_attribute
 
@@ -102,9 +103,9 @@ def _mesh(p: Properties, importer: Importer) -> Shape | None:
     if path is None:
         return None
     flip = np.linalg.det(pose[:3, :3]) < 0.0 and _turned_by_mirrors(p, path, index)
-    if flips == upright:
+    if flips == upright and path.suffix.lower() == _ending(p):
         return _shape(p, "mesh", pose, flip=flip, path=importer.path(path), shape_index=index, face_normals=flat)
-    part = _flipped(_parts(p, path, index))
+    part = _joined(_parts(p, path, index), flips=flips != upright)
     return _shape(p, "mesh", pose, flip=flip, mesh=(part,), face_normals=flat or part.flat or None)
 
 
@@ -118,27 +119,33 @@ def _turned_by_mirrors(p: Properties, path: Path, index: int | None) -> bool:
     return p.flag("face_normals") or all(part.normals is None or part.flat for part in _parts(p, path, index))
 
 
+def _ending(p: Properties) -> str:
+    """Return the ending of the files that a plugin reads, whatever they are called."""
+    return f".{p.plugin}"
+
+
 def _parts(p: Properties, path: Path, index: int | None) -> Sequence[MeshPart]:
     """Return the parts of a mesh file."""
     try:
-        return load_mesh(path, materials=False, index=index)
+        return load_mesh(path, materials=False, index=index, ending=_ending(p))
     except AssetError as error:
-        raise SceneError(f"line {p.element.line}", str(path), error.problem, p.element.file) from None
+        raise p.element.error(str(path), f"a mesh that can be read ({error.problem})") from None
 
 
-def _flipped(parts: Sequence[MeshPart]) -> MeshPart:
-    """Return the parts of a mesh file, joined to one, with flipped texture coordinates."""
+def _joined(parts: Sequence[MeshPart], *, flips: bool) -> MeshPart:
+    """Return the parts of a mesh file, joined to one; ``flips``: with flipped texture coordinates."""
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)])
     normals = [part.normals for part in parts if part.normals is not None]
     uvs = [part.uvs for part in parts if part.uvs is not None]
     colors = [part.colors for part in parts if part.colors is not None]
+    joined = np.concatenate(uvs) if len(uvs) == len(parts) else None
     return MeshPart(
         "",
         np.concatenate([part.vertices for part in parts]),
         faces,
         normals=np.concatenate(normals) if len(normals) == len(parts) else None,
-        uvs=_upside_down(np.concatenate(uvs)) if len(uvs) == len(parts) else None,
+        uvs=_upside_down(joined) if flips and joined is not None else joined,
         colors=np.concatenate(colors) if len(colors) == len(parts) else None,
         flat=all(part.flat for part in parts),
     )
@@ -164,26 +171,31 @@ def with_attribute(shape: Shape, names: Sequence[str], element: Element, importe
             element,
             f"{element.label}: a mesh carries one attribute, {name}, which is taken for {', '.join(others)} as well",
         )
-    flipped = "path" not in shape  # its mesh has been read, with flipped texture coordinates
+    plugin = plugin_name(element.tag, element.type)
+    flipped = any(
+        property_name("shape", plugin, x.attributes.get("name", "")) == "flip_tex_coords"
+        and x.attributes.get("value", "").strip().lower() == "true"
+        for x in element.children
+    )
     given = next(
         (x.attributes.get("value", "") for x in element.children if x.attributes.get("name") == "filename"), ""
     )
     path = importer.find(element, given.strip()) if given else None
     part = None
-    if path is not None and path.suffix.lower() == ".ply":
+    if path is not None and plugin == "ply":
         try:
-            if name == "vertex_color" and load_mesh(path, materials=False)[0].colors is not None:
+            if name == "vertex_color" and load_mesh(path, materials=False, ending=".ply")[0].colors is not None:
                 return shape  # as the file is read anyway
             part = load_ply_attribute(path, name)
             if part is not None and part.uvs is not None and flipped:
                 part = replace(part, uvs=_upside_down(part.uvs))
         except OSError as error:
-            raise SceneError(f"line {element.line}", str(path), f"a file ({error.strerror})", element.file) from None
+            raise element.error(str(path), f"a file that can be read ({error.strerror})") from None
         except AssetError as error:
-            raise SceneError(f"line {element.line}", str(path), error.problem, element.file) from None
+            raise element.error(str(path), f"a mesh that can be read ({error.problem})") from None
     if part is not None:
         return {**{key: value for key, value in shape.items() if key != "path"}, "mesh": (part,)}
-    if name != "vertex_color" or (path is not None and path.suffix.lower() == ".ply"):
+    if name != "vertex_color" or (path is not None and plugin == "ply"):
         importer.notes.add(element, f"{element.label}: the attribute {name} is not in its file, white takes its place")
     return shape
 

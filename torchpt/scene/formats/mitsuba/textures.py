@@ -151,6 +151,10 @@ def _grid(p: Properties, importer: Importer) -> Any:
     return p.colour("color0", [0.2] * 3)
 
 
+def _colour(p: Properties, importer: Importer) -> Any:
+    return p.colour("color", _GREY)
+
+
 def _mean(p: Properties, importer: Importer) -> Any:
     return list(_GREY)
 
@@ -165,6 +169,7 @@ TEXTURES: dict[str, Plugin] = {
         "one attribute of 1 or 3 numbers for each PLY mesh, of vertices or faces; integers are fractions of their largest",
     ),
     "scale": exact("scaled", _scale, "of an image, a checkerboard or a colour"),
+    "srgb": exact("a colour", _colour),
     "gridtexture": nearest("a colour", _grid, "the lines are left out"),
     "wireframe": nearest("a colour", _mean, "grey takes its place"),
     "curvature": nearest("a colour", _mean, "grey takes its place"),

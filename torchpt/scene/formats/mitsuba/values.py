@@ -35,8 +35,8 @@ LARGEST = float(np.finfo(np.float32).max)
 _TO_SRGB = np.array(
     [[3.240479, -1.537150, -0.498535], [-0.969256, 1.875991, 0.041556], [0.055648, -0.204043, 1.057311]]
 )
-# The tables at every nanometre, between whose points they are linear.
-_FINE = np.arange(WAVELENGTHS[0], WAVELENGTHS[-1] + 0.5)
+# The tables at the wavelengths where Mitsuba sums spectra up, half a nanometre apart; between their points they are linear.
+_FINE = np.linspace(WAVELENGTHS[0], WAVELENGTHS[-1], 1000)
 _OBSERVER = np.stack([np.interp(_FINE, WAVELENGTHS, row) for row in XYZ])
 _DAYLIGHT = np.interp(_FINE, WAVELENGTHS, D65)
 _HEX = re.compile(r"#[0-9a-fA-F]{6}\Z")
@@ -59,7 +59,8 @@ def numbers(element: Element, text: str, counts: Sequence[int] = ()) -> list[flo
     except ValueError:
         raise element.error(text, "numbers between blanks or commas") from None
     if not found or (counts and len(found) not in counts):
-        raise element.error(text, f"{' or '.join(map(str, counts)) or 'some'} numbers")
+        words = " or ".join(map(str, counts)) or "some"
+        raise element.error(text, f"{words} number{'' if words == '1' else 's'}")
     if not all(abs(value) <= LARGEST for value in found):  # false for NaN
         raise element.error(text, "finite numbers")
     return found
@@ -115,7 +116,8 @@ def colour(element: Element, *, light: bool, find: FindFile) -> Rgb:
     text = element.attributes.get("value", "").strip()
     if _HEX.match(text):
         value = np.array([int(text[k : k + 2], 16) / 255.0 for k in (1, 3, 5)])
-        return _rgb(_decoded(value))
+        # Before version 2 Mitsuba took those of <rgb> as linear.
+        return _rgb(value if element.tag == "rgb" and element.version < (2,) else _decoded(value))
     found = np.array(numbers(element, text, (1, 3)))
     found = np.broadcast_to(found, 3)
     return _rgb(_decoded(found) if element.tag == "srgb" else found)
@@ -261,21 +263,31 @@ def _operation(element: Element) -> Matrix:
 
 
 def _translate(element: Element) -> Matrix:
+    _check_given(element)
     total = np.eye(4)
     total[:3, 3] = vector(element)
     return total
 
 
 def _scale(element: Element) -> Matrix:
+    _check_given(element)
     return np.diag([*vector(element, default=1.0), 1.0])
+
+
+def _check_given(element: Element) -> None:
+    """Refuse an operation none of whose attributes is one that it has; without any it does nothing, as in Mitsuba."""
+    if element.attributes and not any(key in element.attributes for key in ("value", *"xyz")):
+        raise element.error(f"<{element.written}>", "x, y, z or value")
 
 
 def _rotate(element: Element) -> Matrix:
     attributes = element.attributes
+    if "angle" not in attributes:
+        raise element.error("<rotate>", "an attribute angle")
     axis = vector(element)
     if not any(key in attributes for key in ("value", *"xyz")):
         axis = [0.0, 0.0, 1.0]
-    return transforms.rotate({"axis": axis, "angle": number(element, attributes.get("angle", "0"))})
+    return transforms.rotate({"axis": axis, "angle": number(element, attributes["angle"])})
 
 
 def _matrix(element: Element) -> Matrix:
