@@ -541,7 +541,7 @@ def test_large_steps_find_a_smooth_shape() -> None:
         return total, float(distance), float(torchpt.losses.mesh_normal_consistency(found, faces))
 
     _, plain_distance, plain_normals = fitted(torch.optim.Adam, 0.01)
-    loss, distance, normals = fitted(AdamUniform, 0.05, parametrizations={name: LargeSteps(faces)})
+    loss, distance, normals = fitted(AdamUniform, 0.1, parametrizations={name: LargeSteps(faces)})
     start = float((points - wanted).square().sum(1).mean().sqrt())
     assert loss < 0.6 * 3.0 * 1.36e-3 and distance < 0.85 * start and distance < 0.85 * plain_distance
     assert normals < 1.5 * float(torchpt.losses.mesh_normal_consistency(wanted, faces)) < 0.3 * plain_normals
