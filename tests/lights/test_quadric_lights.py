@@ -10,6 +10,7 @@ from few import few
 from trials import film_of, shoot, spread, z_limit
 
 import torchpt
+from torchpt.core.errors import warn_once
 from torchpt.math.sampling import Distribution1D, uniform_sphere
 from torchpt.physics import lights
 from torchpt.physics.shapes import interact
@@ -147,3 +148,40 @@ def test_every_strategy_agrees_under_all_of_them():
             spread_ = blocks(variance + noise, side) / side**2
             z = (blocks(other, side) - blocks(mean, side)) / spread_.sqrt().clamp_min(1e-12)
             assert z.abs().max() <= 1.25 * z_limit(z.numel()), (strategy, side, z.abs().max())
+
+
+@pytest.mark.filterwarnings("ignore::torchpt.EdgeWarning")
+def test_the_pose_of_a_lone_ellipsoid_has_its_derivative_by_kernels(capfd: pytest.CaptureFixture[str]) -> None:
+    warn_once.cache_clear()
+    scene = torchpt.load(
+        {
+            "camera": {"origin": [0, 1, 5], "target": [0, 0, 0], "fov": 40},
+            "film": {"width": 8, "height": 8},
+            "integrator": {"type": "path", "max_depth": 2},
+            "shapes": {
+                "lamp": {
+                    "type": "sphere",
+                    "emission": 4,
+                    "transform": [{"scale": [0.5, 0.2, 0.3]}, {"translate": [0.5, 0, 0.5]}],
+                },
+                "floor": {
+                    "type": "rectangle",
+                    "transform": [
+                        {"rotate": {"axis": [1, 0, 0], "angle": -90}},
+                        {"scale": 4},
+                        {"translate": [0, -1, 0]},
+                    ],
+                },
+            },
+        },
+        "cpu",
+    )
+    found = []
+    for compiled in ("on", "off"):
+        pose = scene.params["shapes.lamp.to_world"].clone().requires_grad_()
+        wish = {"spp": 1, "spp_grad": 16, "edges": False, "compile": compiled}
+        torchpt.render(scene, params={"shapes.lamp.to_world": pose}, **wish).mean().backward()
+        assert pose.grad is not None
+        found.append(pose.grad)
+    torch.testing.assert_close(found[0], found[1], rtol=1e-3, atol=1e-5)
+    assert "tensor operations" not in capfd.readouterr().err

@@ -53,7 +53,10 @@ def lane_rows(lights: Lights, row: Tensor | None) -> Lights:
     quadrics = lights.quadrics
     if quadrics is not None:
         assert lights.quadric is not None
-        quadrics = rows_of(quadrics, lights.quadric if row is None else take(lights.quadric, row))
+        if row is not None:
+            quadrics = rows_of(quadrics, take(lights.quadric, row))
+        elif quadrics.e3.shape[1] > 1:  # a look-up of one column for all lanes has no derivative by kernels
+            quadrics = rows_of(quadrics, lights.quadric)
     if row is None:
         return lights if quadrics is None else replace(lights, quadrics=quadrics)
     opacity = None if lights.opacity is None else take(lights.opacity, row)
