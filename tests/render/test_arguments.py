@@ -404,3 +404,18 @@ def test_numbers_that_are_not_finite_are_named_by_their_place(scene: torchpt.Sce
 def test_what_print_says_of_a_scene(scene: torchpt.Scene) -> None:
     said = f"Scene(of a mapping: 4 x 4, 1 shapes, 1 primitives, {len(scene.params)} parameters, cpu)"
     assert repr(scene) == said
+
+
+@pytest.mark.parametrize("kind", [torch.float64, torch.bfloat16])
+def test_another_default_dtype_of_torch_is_refused(scene: torchpt.Scene, kind: torch.dtype) -> None:
+    """Random numbers would have it: pictures were wrong, without a word."""
+    value = scene.params["shapes.ball.material.reflectance"].clone().requires_grad_()
+    picture = torchpt.render(scene, params={"shapes.ball.material.reflectance": value}, spp=1)
+    torch.set_default_dtype(kind)
+    try:
+        for call in (lambda: torchpt.render(scene, spp=1), lambda: picture.mean().backward()):
+            with pytest.raises(SceneError, match=rf"^torch.get_default_dtype: expected torch.float32; .* got {kind}"):
+                call()
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert torch.equal(torchpt.render(scene, spp=1), picture)

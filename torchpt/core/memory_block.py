@@ -18,14 +18,14 @@ class MemoryBlock:
     """A block of memory for ``size`` numbers in float32, filled by :meth:`add`."""
 
     def __init__(self, size: int) -> None:
-        self._numbers, self._end = torch.empty(size), 0
+        self._numbers, self._end = torch.empty(size, dtype=torch.float32), 0
 
     def add(self, array: NDArray[np.float32]) -> Tensor:
         """Return a tensor with the values of ``array``, after those that were added before."""
         start, self._end = self._end, self._end + array.size
         view = self._numbers[start : self._end].view(array.shape)
         # A tensor of its own in the same memory: views share their count of changes in place.
-        added = torch.empty(0).set_(view.untyped_storage(), start, view.shape, view.stride())
+        added = torch.empty(0, dtype=torch.float32).set_(view.untyped_storage(), start, view.shape, view.stride())
         return added.copy_(torch.from_numpy(array))
 
 

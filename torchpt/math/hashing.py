@@ -8,6 +8,7 @@ complement.
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from torchpt.core.dispatch import dispatched
@@ -56,4 +57,4 @@ def mix_int(x: int) -> int:
 
 def to_unit(x: Tensor) -> Tensor:
     """Convert the top 24 bits of int32 lanes to float32 in ``[0, 1 - 2^-24]``, exactly."""
-    return logical_shift(x, 8) * (1.0 / (1 << 24))
+    return logical_shift(x, 8).to(torch.float32) * (1.0 / (1 << 24))

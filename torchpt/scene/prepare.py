@@ -150,8 +150,13 @@ def make_wave(
         edges: True for rays of edges: they search a tree even where packets would be faster, and sample lights alone too.
 
     Raises:
-        SceneError: a direction that is zero, or a ray that is not finite.
+        SceneError: a direction that is zero, a ray that is not finite, or another default dtype of torch than float32.
     """
+    if torch.get_default_dtype() != torch.float32:  # products of whole numbers and numbers would have it
+        expected = (
+            "torch.float32; pictures and gradients in double precision are asked for by render(dtype=torch.float64)"
+        )
+        raise SceneError("torch.get_default_dtype", torch.get_default_dtype(), expected)
     film, spp = settings.film, settings.render.spp
     integrator = settings.integrator.counted_in(scene.space.unit)  # its lengths, in the unit of lanes
     params = params or {}

@@ -74,7 +74,7 @@ def build_tree(low: Tensor, high: Tensor, ids: Tensor) -> RadixTree:
     n, device = ids.shape[0], ids.device
     if n < 2:
         # a root with one leaf, or none; the second child's box is empty
-        boxes = torch.full((12, min(n, 1)), torch.inf, device=device)
+        boxes = torch.full((12, min(n, 1)), torch.inf, dtype=torch.float32, device=device)
         boxes[9:12] = -torch.inf
         boxes[0:3], boxes[3:6] = low, high
         return RadixTree(torch.full((2, min(n, 1)), -1, dtype=torch.int32, device=device), boxes, ids.int(), min(n, 1))

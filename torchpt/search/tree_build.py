@@ -76,7 +76,11 @@ class NonTriangles:
         rest = _without_triangles(geometry)
         if not rest.size:  # to save time: the operations below take longer than the build of a small mesh
             self.area, self.boxes = np.zeros(0, bool), np.zeros((0, 6), np.float32)
-            self.tensors = [torch.zeros(0, 12), torch.zeros(0, 12), torch.zeros(0, QUADRIC, dtype=torch.float64)]
+            self.tensors = [
+                torch.zeros(0, 12, dtype=torch.float32),
+                torch.zeros(0, 12, dtype=torch.float32),
+                torch.zeros(0, QUADRIC, dtype=torch.float64),
+            ]
             return
         tables = affine_rows(rest)
         area = tables.area

@@ -163,7 +163,7 @@ class InstancedWideBvh(Accel):
 
 def _no_primitives() -> Geometry:
     """Return a geometry without primitives."""
-    none = torch.zeros(3, 0)
+    none = torch.zeros(3, 0, dtype=torch.float32)
     return Geometry(none, none, none, (0, 0, 0, 0, 0))
 
 

@@ -203,7 +203,9 @@ def store_hits(trace: Trace) -> Sinks:
     splat = layout.state.read(tracer, *_SPLAT)
     slots = Rows(slots_of(layout))
     with tracer:
-        transmittance = light["transmittance"] if "transmittance" in light else torch.zeros(tracer.lanes)
+        transmittance = (
+            light["transmittance"] if "transmittance" in light else torch.zeros(tracer.lanes, dtype=torch.float32)
+        )
         if "blocked" in light and "transmittance" not in light:
             transmittance = (light["blocked"] == 0).to(torch.float32)
     rows = tuple(slots.nodes(tracer, transmittance=transmittance, **hit, **splat))

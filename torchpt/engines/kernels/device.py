@@ -223,7 +223,7 @@ class DeviceCalls:
             known = self._salts[depth, step] = self.cuda.to_device(salts(depth, torch.device("cpu"), step))
         bound = self._bounds.get(roulette)
         if bound is None:
-            bound = self._bounds[roulette] = self.cuda.to_device(torch.tensor([roulette]))
+            bound = self._bounds[roulette] = self.cuda.to_device(torch.tensor([roulette], dtype=torch.float32))
         number = self._depths.get(depth)
         if number is None:
             number = self._depths[depth] = self.cuda.to_device(torch.tensor([depth], dtype=torch.int32))

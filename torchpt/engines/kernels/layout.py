@@ -231,7 +231,11 @@ class Rows:
             # Any values do: a trace records operations, not results. torch's default generator is the caller's.
             numbers = torch.Generator().manual_seed(first)
             floats = dtype.is_floating_point
-            like = torch.rand(size, generator=numbers) + 0.25 if floats else torch.zeros(size, dtype=dtype)
+            like = (
+                torch.rand(size, generator=numbers, dtype=torch.float32) + 0.25
+                if floats
+                else torch.zeros(size, dtype=dtype)
+            )
 
             def node(k: int, first: int = first, ty: str = ty) -> int:
                 if place is not None:
@@ -347,7 +351,7 @@ def _key_field(wave: Wave) -> Fields:
 def _state_of_one_lane(rows: int) -> PathState:
     """Return a state of one lane whose key has so many rows, of which only names, shapes and types are read."""
     with outside_transforms(), outside_inference_mode():
-        vector, key = torch.zeros(3, 1), torch.zeros(rows, 1, dtype=torch.int32)
+        vector, key = torch.zeros(3, 1, dtype=torch.float32), torch.zeros(rows, 1, dtype=torch.int32)
         return camera_state(vector, vector, key)
 
 
@@ -434,11 +438,11 @@ class Trace:
     def merging(self) -> Tensor | None:
         """Return the ratio of densities of a merge ``(1,)``; None for an integrator without merges."""
         counts = self.layout.wave.context.merging is not None
-        return self.uniform("merging", torch.ones(1)) if counts else None
+        return self.uniform("merging", torch.ones(1, dtype=torch.float32)) if counts else None
 
     def roulette(self, bound: float | None) -> float | Tensor:
         """Return the upper bound of the survival probability; 0: no roulette at the vertex. None: an input ``(1,)``."""
-        return self.uniform("roulette", torch.zeros(1)) if bound is None else bound
+        return self.uniform("roulette", torch.zeros(1, dtype=torch.float32)) if bound is None else bound
 
     def state(self) -> tuple[PathState, dict[str, Tensor]]:
         """Return the path state, and rows that stages do not read but that are passed on: the filter ``weight``."""

@@ -568,11 +568,13 @@ def accumulate(trace: Trace, channels: int, clamp: bool) -> Sinks:
     """
     tracer, graph = trace.tracer, trace.tracer.graph
     trace.tensors = 2  # inputs: the samples and the sums
-    sample = tracer.lane(torch.zeros(channels, tracer.lanes), lambda k: graph.node("tensor", "f", extra=(0, k)))
+    sample = tracer.lane(
+        torch.zeros(channels, tracer.lanes, dtype=torch.float32), lambda k: graph.node("tensor", "f", extra=(0, k))
+    )
     total = tracer.lane(
         torch.zeros(channels, tracer.lanes, dtype=torch.float64), lambda k: graph.node("tensor", "d", extra=(1, k))
     )
-    limit = trace.uniform("clamp", torch.ones(1)) if clamp else None
+    limit = trace.uniform("clamp", torch.ones(1, dtype=torch.float32)) if clamp else None
     with tracer:
         finite = torch.isfinite(sample).all(0)
         bad = ~finite

@@ -102,7 +102,7 @@ def lights_of(
     if emitting:
         surfaces, column = _surfaces(emitting, primitives, parameters, prim)
         groups.append(surfaces)
-    radius = _scene_radius(geometry) if sources else torch.ones((), device=device)
+    radius = _scene_radius(geometry) if sources else torch.ones((), dtype=torch.float64, device=device)
     environments = []
     for source in sources:
         row, environment = _source(source, parameters, space, radius, dtype, alone)
@@ -149,7 +149,11 @@ def lights_of(
 def _scene_radius(geometry: Geometry) -> Tensor:
     """Return the radius ``()`` of the scene: half the diagonal of its bounding box, float64; 1 without surfaces."""
     low, high = (box.double() for box in primitive_bounds(geometry))
-    return (high.amax(1) - low.amin(1)).norm() * 0.5 if low.shape[1] else torch.ones((), device=low.device)
+    return (
+        (high.amax(1) - low.amin(1)).norm() * 0.5
+        if low.shape[1]
+        else torch.ones((), dtype=torch.float64, device=low.device)
+    )
 
 
 def _surfaces(

@@ -52,6 +52,6 @@ class Null(Bsdf):
 
     def split_sum(self, parameters: Parameters) -> SplitSumMaterial:
         """Return a material that transmits all light."""
-        black = torch.zeros(3, len(parameters["row"]), device=parameters["row"].device)
+        black = torch.zeros(3, len(parameters["row"]), dtype=torch.float32, device=parameters["row"].device)
         zero = black[0]
         return SplitSumMaterial(diffuse=black, f0=zero, f90=zero, roughness=zero, over=zero, through=black + 1.0)
