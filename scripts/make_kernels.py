@@ -14,12 +14,16 @@ import hashlib
 import importlib
 import io
 import lzma
+import os
 import sys
 import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 
 from torchpt.native.kernels import FOLDER, read_module
+
+#: CPU for which numba's own passes work, whatever the machine: they make loops of gathers where a CPU's are slow.
+CPU = {"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": ""}
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = ROOT / "scripts" / "kernel_sources"
@@ -41,6 +45,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--check", action="store_true", help="write nothing")
     check = parser.parse_args(arguments).check
+    os.environ |= CPU  # before numba is imported
     made, changed = make(), []
     for name, text in made.items():
         path = FOLDER / f"{name}.ll.xz"

@@ -21,7 +21,7 @@ def test_the_lessons_run(tmp_path, monkeypatch, capsys):
     torch.manual_seed(0)
     names: dict[str, object] = {}
     blocks = BLOCK.findall(PAGE.read_text(encoding="utf-8"))
-    assert len(blocks) == 13
+    assert len(blocks) == 14
     for block in blocks:
         exec(compile(block, str(PAGE), "exec"), names)
     for name in ("fov", "paint"):

@@ -72,13 +72,13 @@ def _paths(scene: torchpt.Scene) -> dict[str, Any]:
 
 
 def call_backward(scene: torchpt.Scene) -> None:
-    """Render a gradient by all parameters; of scenes with opacity by vertices and poses alone.
+    """Render a gradient by all parameters; of scenes with opacity by colours of their materials alone.
 
-    Opacity is differentiated by tensor operations, and so is a texture whose table it shares.
+    Opacity is differentiated by tensor operations, and so are textures of its table, and geometry (indices bend rays).
     """
     owners, named = (*scene.built.parts, *scene.built.copies), dict(scene.params)
     if any(owner.material.opacity != 1.0 for owner in owners):
-        named = {name: value for name, value in named.items() if name.endswith((".vertices", ".to_world"))}
+        named = {name: value for name, value in named.items() if ".material" in f".{name}" and value.dim() == 1}
     given = {name: value.clone().requires_grad_() for name, value in named.items()}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # which edges a gradient leaves out does not matter here
