@@ -78,7 +78,11 @@ def call_backward(scene: torchpt.Scene) -> None:
     """
     owners, named = (*scene.built.parts, *scene.built.copies), dict(scene.params)
     if any(owner.material.opacity != 1.0 for owner in owners):
-        named = {name: value for name, value in named.items() if ".material" in f".{name}" and value.dim() == 1}
+        named = {
+            name: value
+            for name, value in named.items()
+            if ".material" in f".{name}" and ".color" not in name and value.dim() == 1
+        }
     given = {name: value.clone().requires_grad_() for name, value in named.items()}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # which edges a gradient leaves out does not matter here
