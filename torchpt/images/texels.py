@@ -68,6 +68,10 @@ class Texels:
         linear = self.linear(colours)
         return linear if colours == channels else np.concatenate((linear, self.values[..., colours:]), axis=2)
 
+    def is_encoded(self, colorspace: str) -> bool:
+        """Return True if colours are to be decoded from sRGB: whole numbers for ``srgb``, those of 8 bits for ``auto``."""
+        return self.eight_bit if colorspace == "auto" else colorspace == "srgb" and self.white is not None
+
     def linear(self, channels: int) -> NDArray[np.float32]:
         """Return the first channels, decoded from sRGB; values of 8 bits by a table."""
         if self.white is None or self.white > 255:
@@ -149,8 +153,7 @@ def texels_to_radiance(texels: Texels, source: str, key: str, colorspace: str = 
         Refused: a negative value.
     """
     channels = 3 if texels.stored.shape[2] >= 3 else 1
-    encoded = texels.eight_bit if colorspace == "auto" else colorspace == "srgb" and texels.white is not None
-    values = texels.linear(channels) if encoded else texels.values[..., :channels]
+    values = texels.linear(channels) if texels.is_encoded(colorspace) else texels.values[..., :channels]
     if channels == 1:
         values = values.repeat(3, 2)
     if values.min() < 0:

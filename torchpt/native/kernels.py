@@ -174,7 +174,9 @@ def bound_to(kernel: Kernel, memory: int, args: tuple[Any, ...]) -> Callable[[in
     scratch = np.empty(memory, np.uint8)
     words, call = kernel.words(0, 0, address_of(scratch), *args)[2:], kernel.call
 
-    def run(items: int, _kept: Any = (scratch, args)) -> None:
+    def run(
+        items: int, _kept: Any = (scratch, args)
+    ) -> None:  # words are addresses: their memory lives as long as this
         call(0, items, *words)
 
     return run

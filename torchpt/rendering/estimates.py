@@ -122,18 +122,18 @@ def gradient(
         values = {name: _leaf(value) for name, value in _named(scene, params).items()}
         if not values:
             raise SceneError("params", params, "at least one name of scene.params")
-        takes = _Passes(scene, values, share, first, options)
+        independent = _Passes(scene, values, share, first, options)
         found, changes = None, list[Tensor]()
         if not isinstance(loss, Tensor):
             with torch.no_grad():
                 picture = render(scene, params=values, spp=spp, seed=first, **options)
             found, cotangent = _cotangent(loss, picture)
-            changes = _changes(loss, cotangent, takes.pictures(passes, number=passes + 1))
+            changes = _changes(loss, cotangent, independent.pictures(passes, number=passes + 1))
         else:
             cotangent = loss
-        each = takes.gradients([cotangent] * passes, number=1)
-        noise = takes.gradients(changes, number=2 * passes + 1)
-    not_finite = sum(passes - len(grads) for grads in each.values())
+        each = independent.gradients([cotangent] * passes, number=1)
+        noise = independent.gradients(changes, number=2 * passes + 1)
+    not_finite = sum(passes - len(each[name]) + len(changes) - len(noise[name]) for name in each)
     for name, grads in each.items():
         if len(grads) < 2:
             raise SceneError(name, "gradients that are not finite", "at least two passes with finite ones")

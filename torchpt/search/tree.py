@@ -174,14 +174,13 @@ class WideBvh(Accel):
 
     def nearest(self, o: Array, d: Array, t_max: Array, count: int, t: Array, prim: Array, u: Array, v: Array) -> None:
         """See :meth:`Accel.nearest`."""
-        self._run("nearest", count, 1, o, d, t_max, t, prim, u, v)
+        self.nearest_in(o, d, t_max, t, prim, u, v)(count)
 
     def blocked(
         self, o: Array, d: Array, t_max: Array, count: int, out: Array, non_opaque: Array | None = None
     ) -> None:
         """See :meth:`Accel.blocked`."""
-        flags = _ALL_OPAQUE if non_opaque is None else non_opaque
-        self._run("occluded", count, 1, o, d, t_max, flags, len(flags), out)
+        self.blocked_in(o, d, t_max, out, non_opaque)(count)
 
     def nearest_in(self, o: Array, d: Array, t_max: Array, t: Array, prim: Array, u: Array, v: Array) -> Search:
         """See :meth:`Accel.nearest_in`."""

@@ -332,7 +332,7 @@ def _length(x: Tensor) -> Tensor:
 
 
 def resolvable_slope(slope: Tensor, steepest: Tensor, distance: Tensor) -> Tensor:
-    """Return the slopes ``(N,)`` of a surface's equation along rays, as large as rounding can tell from 0, and not 0.
+    """Return the slopes ``(N,)`` of a surface's equation along rays, raised to the least size that rounding can tell from 0.
 
     At the limb of a round body a hit is off by the root of a rounding error, and one over such a slope is noise without bounds.
     What is lost is about half the cosine from which on slopes count: .05 % of a derivative, seen from ten radii away.

@@ -180,9 +180,7 @@ def _is_encoded(picture: Texels, colorspace: str, *, linear: bool) -> bool:
         colorspace: as the scene says; ``auto``: images of 8 bits a value are encoded, unless they give no colours.
         linear: True: the values of its slot are no colours.
     """
-    if colorspace == "auto":
-        return picture.eight_bit and not linear
-    return colorspace == "srgb" and picture.white is not None
+    return picture.is_encoded(colorspace) and not (linear and colorspace == "auto")
 
 
 def _read_converted(path: FilePath, max_pixels: int, colorspace: str, *, linear: bool) -> Texels:

@@ -325,7 +325,7 @@ class Importer:
             picture = read_texels(path)
         except AssetError:
             return False  # refused when the scene is built, with more words
-        values = picture.decoded if texture["colorspace"] == "srgb" and picture.white is not None else picture.values
+        values = picture.decoded if picture.is_encoded(texture["colorspace"]) else picture.values
         return bool(values.min() < 0.0 or values.max() * scale > 1.0 + 1e-6)
 
     def _key(self, taken: Mapping[str, Any], element: Element) -> str:
