@@ -240,7 +240,8 @@ def test_stratified_numbers_stay_so():
     row, column, rest = grid.cells.sample(u)
     counts = torch.bincount(row, minlength=8).double() / side
     assert ((counts - grid.cells.rows.diff() * side).abs() <= 1.0).all()
-    inside = grid.cells.columns.diff().view(8, 14) * grid.cells.rows.diff()[:, None] * side * side
+    shares = grid.cells.ends.view(8, -1)[:, :14].double().diff(prepend=torch.zeros(8, 1, dtype=torch.float64)) / 2**31
+    inside = shares * grid.cells.rows.diff()[:, None] * side * side
     found = torch.bincount(row * 14 + column, minlength=8 * 14).view(8, 14).double()
     assert ((found - inside).abs() <= 1 + 2 * side * (inside > 0) * 0.5).all()
     assert (rest >= 0).all() and (rest <= 1).all()
@@ -334,7 +335,7 @@ def test_every_lane_rounds_alike():
 
 def test_cells_and_their_ends():
     weights = torch.tensor([[0.0, 0, 0], [0, 2, 0], [0, 0, 0], [1, 0, 1], [0, 0, 0]])
-    cells = Distribution2D.within(Distribution2D.room(5, 3, weights.device).copy_(weights))
+    cells = Distribution2D.of([weights.double()], 5, 3, weights.device)
     u = torch.tensor(
         [[0.0, 0.0], [1 - 2.0**-24, 0.0], [0.0, 1 - 2.0**-24], [1 - 2.0**-24, 1 - 2.0**-24]]
     ).T.contiguous()
@@ -344,6 +345,28 @@ def test_cells_and_their_ends():
     # 1 - 2^-53 is the largest double below 1.
     row, column, _ = cells.sample(torch.full((2, 1), 1 - 2.0**-53, dtype=torch.float64))
     assert row.tolist() == [3] and column.tolist() == [2]
+
+
+@pytest.mark.parametrize("shape", [(5, 7), (3, 64), (4, 65), (1, 128), (2, 2048), (200, 1), (1, 200)])
+def test_cells_are_drawn_by_their_weight(shape):
+    """Rows shorter and longer than a block and as long as one, with cells and a row that have no weight."""
+    rng = torch.Generator().manual_seed(sum(shape))
+    weights = torch.rand(shape, generator=rng, dtype=torch.float64) ** 4
+    weights[torch.rand(shape, generator=rng) < 0.3] = 0.0
+    if shape[0] > 2:
+        weights[1] = 0.0
+    chance = (weights / weights.sum()).flatten()
+    u = torch.rand(2, N, generator=rng)
+    row, column, rest = Distribution2D.of(weights.split(2), *shape, weights.device).sample(u)
+    assert int(column.min()) >= 0 and int(column.max()) < shape[1] and float(rest.min()) >= 0 and float(rest.max()) <= 1
+    counts = torch.bincount(row * shape[1] + column, minlength=len(chance)).double()
+    assert (counts[chance == 0] == 0).all()
+    often = chance * N > 20
+    expected, counts = ([*x[often], x[~often].sum()] for x in (chance * N, counts))
+    statistic = sum((c - e) ** 2 / e for c, e in zip(counts, expected, strict=True) if e > 0)
+    assert chi_square_p(float(statistic), len(expected) - 1) > SIGNIFICANCE
+    # What is left of a number lies evenly in its cell.
+    assert (rest.double().mean(1) - 0.5).abs().max() < 5.0 / math.sqrt(12.0 * N)
 
 
 @pytest.mark.parametrize(("a", "b"), [(1.0, 1.0), (0.0, 3.0), (2.0, 0.0), (1e-30, 1e30), (1e30, 1e-3), (1.0, 1.0001)])

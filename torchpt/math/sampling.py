@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
@@ -173,55 +174,61 @@ class Distribution1D:
         return outcome, ((u - low) / torch.where(width > 0, width, 1.0)).clamp(0.0, 1.0)
 
 
-#: Entries of a block, and the most that are searched without blocks.
-_BLOCK, _SMALL = 64, 2**15
+#: Entries of a block of :attr:`Distribution2D.ends`, and 1 there.
+_BLOCK, _ONE = 64, 2.0**31
 
 
 @dataclass(frozen=True)
 class Distribution2D:
     """A discrete distribution over the cells of an R x C grid, by rows, then by columns.
 
-    The preimage of a cell is a rectangle of the unit square, so stratified points stay stratified.
+    The preimage of a cell is a rectangle of the unit square, so stratified points stay stratified. Cumulative sums over the
+    columns are rounded to 31 bits, random numbers have 24: a grid may be large, and tables that fit into a cache are faster.
 
     Attributes:
         rows: ``(R + 1,)`` float64 cumulative sums over the rows, from 0 to 1.
-        columns: ``(R C + 1,)`` float64: row number plus the cumulative sums within that row. They never decrease, so one
-            binary search finds a cell of any row.
-        width: ``()`` int64, the number C of columns.
-        blocks: every 64th entry of ``columns``, which fit into a cache where all of them do not; None for a small grid.
-            ``columns`` ends with infinity up to a whole block.
+        ends: ``(R S,)`` int32 cumulative sums over the columns of each row, times 2^31, rounded down and below 2^31; C of
+            them and as many more as fill a whole block. A cell ends where the next one begins.
+        blocks: ``(R S / 64,)`` float64: row number plus the last of each 64 ``ends``, as a fraction. They never decrease.
+        stride: ``()`` int64, the number S.
     """
 
     rows: Tensor
-    columns: Tensor
-    width: Tensor
-    blocks: Tensor | None
+    ends: Tensor
+    blocks: Tensor
+    stride: Tensor
 
     @staticmethod
-    def room(rows: int, columns: int, device: torch.device) -> Tensor:
-        """Return memory ``(rows, columns)`` float64 for weights, which :meth:`within` overwrites: grids may be large."""
-        count = 1 + rows * columns
-        rest = -count % _BLOCK if count > _SMALL else 0
-        memory = torch.empty(count + rest, dtype=torch.float64, device=device)
-        memory[0] = 0.0
-        memory[count:] = torch.inf
-        return memory[1:count].view(rows, columns)
+    def of(blocks: Iterable[Tensor], rows: int, columns: int, device: torch.device) -> Distribution2D:
+        """Return the distribution of non-negative weights, at least one of them positive.
 
-    @staticmethod
-    def within(weights: Tensor) -> Distribution2D:
-        """Build the distribution of non-negative weights, at least one of them positive, in the memory of :meth:`room`."""
-        memory = weights.new_empty(0).set_(weights.untyped_storage())
-        along = weights.cumsum_(1)  # over the columns of each row
-        total = along[:, -1:].clone()
-        # A row without weight is never drawn.
-        along.div_(torch.where(total > 0, total, 1.0)).masked_fill_(total <= 0, 1.0)
-        along += torch.arange(len(along), dtype=along.dtype, device=along.device)[:, None]
-        down = torch.cumsum(total[:, 0], 0)
+        Args:
+            blocks: some of the rows ``(n, columns)`` float64 each, which are overwritten: a grid may be large.
+            rows: number of all of them.
+            columns: of the grid.
+            device: of the weights.
+        """
+        top = int(_ONE) - 1
+        ends = torch.full((rows, columns + -columns % _BLOCK), top, dtype=torch.int32, device=device)
+        totals: list[Tensor] = []
+        first = 0
+        for weights in blocks:
+            along = weights.cumsum_(1)
+            total = along[:, -1].clone()
+            # A row without weight is never drawn.
+            along.mul_((_ONE / torch.where(total > 0, total, 1.0))[:, None]).clamp_max_(top)
+            ends[first : first + len(along), :columns] = along
+            totals.append(total)
+            first += len(along)
+        down = torch.cat(totals).cumsum(0)
+        last = ends[:, _BLOCK - 1 :: _BLOCK].double() / _ONE
+        last[:, -1] = 1.0
+        last += torch.arange(rows, dtype=last.dtype, device=device)[:, None]
         return Distribution2D(
             rows=torch.cat((down.new_zeros(1), down / down[-1])),
-            columns=memory,
-            width=torch.tensor(along.shape[1], dtype=torch.int64, device=along.device),
-            blocks=memory[::_BLOCK].contiguous() if along.numel() >= _SMALL else None,
+            ends=ends.view(-1),
+            blocks=last.view(-1),
+            stride=torch.tensor(ends.shape[1], dtype=torch.int64, device=device),
         )
 
     def sample(self, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -229,24 +236,20 @@ class Distribution2D:
 
         ``u[0]`` draws columns, ``u[1]`` rows. A cell without weight is never drawn.
         """
-        # Just below 1 a row number plus u would round to the next row.
-        v = u.double().contiguous().clamp_max(1.0 - 2.0**-32)
+        v = u.double().contiguous().clamp_max(1.0 - 2.0**-30)  # below all of what fills a block
         row = torch.searchsorted(self.rows, v[1], right=True) - 1
-        across = v[0] + row
-        cell = self._cell(across)
-        rest = torch.stack((_within(self.columns, cell, across), _within(self.rows, row, v[1])))
-        return row, cell - row * self.width, rest.to(u.dtype)
-
-    def _cell(self, across: Tensor) -> Tensor:
-        """Return the last entries ``(N,)`` of ``columns`` that are not above ``across (N,)``."""
-        if self.blocks is None:
-            return torch.searchsorted(self.columns, across, right=True) - 1
-        cell = (torch.searchsorted(self.blocks, across, right=True) - 1) * _BLOCK
+        across = v[0] * _ONE
+        digits = across.to(torch.int32)
+        # The first block that ends beyond, then the first cell of it that does.
+        cell = torch.searchsorted(self.blocks, row + digits.double() / _ONE, right=True) * _BLOCK
         step = _BLOCK // 2
         while step:
-            cell = torch.where(take(self.columns, cell + step) <= across, cell + step, cell)
+            cell = torch.where(take(self.ends, cell + (step - 1)) <= digits, cell + step, cell)
             step //= 2
-        return cell
+        column = cell - row * self.stride
+        low = torch.where(column > 0, take(self.ends, (cell - 1).clamp_min(0)), 0).double()
+        rest = torch.stack(((across - low) / (take(self.ends, cell).double() - low), _within(self.rows, row, v[1])))
+        return row, column, rest.to(u.dtype)
 
 
 def _within(cdf: Tensor, index: Tensor, v: Tensor) -> Tensor:

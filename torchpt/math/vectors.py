@@ -26,6 +26,7 @@ __all__ = [
     "normalize",
     "rows",
     "safe_reciprocal",
+    "side_by_side",
     "take",
 ]
 
@@ -108,6 +109,15 @@ def take(table: Tensor, index: Tensor | None) -> Tensor:
         # torch's index_select is vectorized for float32 alone.
         return torch.gather(table, 1, index.long().expand(len(table), -1))
     return torch.index_select(table, table.dim() - 1, index)
+
+
+#: Fewer columns are laid out by kernels themselves in no time.
+_COLUMNS = 4096
+
+
+def side_by_side(table: Tensor) -> Tensor:
+    """Return a table ``(C, M)`` of which each column lies in one place of memory: kernels read it so, without a copy."""
+    return table if table.shape[1] < _COLUMNS else table.T.contiguous().T
 
 
 T = TypeVar("T")

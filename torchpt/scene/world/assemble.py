@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from torchpt.core.errors import SceneError
+from torchpt.math.vectors import side_by_side
 from torchpt.physics.bsdfs import Bsdf, Parameters
 from torchpt.physics.bsdfs.records import LaneMaterials
 from torchpt.physics.bsdfs.resolved import ResolvedMaterial
@@ -149,7 +150,7 @@ class _Assembly(Pieced):
             kinds=primitives.kinds,
             counts=primitives.counts,
             ends=torch.tensor(primitives.counts, dtype=torch.int64, device=self.device).cumsum(0),
-            p0=primitives.p0,
+            p0=side_by_side(primitives.p0),
             e1=primitives.e1,
             e2=primitives.e2,
             normal=primitives.normal,

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from torchpt.core.errors import SceneError
+from torchpt.math.vectors import side_by_side
 from torchpt.physics.bsdfs import KINDS, Bsdf, Parameters, stacked
 from torchpt.physics.bsdfs.resolved import ResolvedMaterial
 from torchpt.physics.parts import Copy, Part
@@ -86,10 +87,11 @@ def vertex_attributes_of(
             kind.tangent_columns(part, part_corners, part_uvs, parameters[f"{part.name}.to_world"][:3, :3])
             for kind, (part, part_corners), part_uvs in zip(kinds, pairs, uvs, strict=True)
         ]
-        found["tangents"] = torch.cat([by_u for by_u, _ in derivatives], 1)
-        found["bitangents"] = torch.cat([by_v for _, by_v in derivatives], 1) if needs_bitangents else None
+        found["tangents"] = side_by_side(torch.cat([by_u for by_u, _ in derivatives], 1))
+        if needs_bitangents:
+            found["bitangents"] = side_by_side(torch.cat([by_v for _, by_v in derivatives], 1))
     if needs_uvs:
-        found["uvs"] = tuple(torch.cat([part_uvs[k] for part_uvs in uvs], 1) for k in range(3))
+        found["uvs"] = tuple(side_by_side(torch.cat([part_uvs[k] for part_uvs in uvs], 1)) for k in range(3))
         spheres = [parameters[f"{part.name}.to_world"] for part in parts if part.kind == "sphere"]
         if spheres:
             from torchpt.physics.shapes.primitives.sphere import axes
@@ -100,7 +102,7 @@ def vertex_attributes_of(
         found["mirrored"] = torch.repeat_interleave(flags, torch.tensor(sizes, device=flags.device))
     if needs_colors:
         colors = [_colors(c) for c in corners]
-        found["colors"] = tuple(torch.cat([triple[k] for triple in colors], 1) for k in range(3))
+        found["colors"] = tuple(side_by_side(torch.cat([triple[k] for triple in colors], 1)) for k in range(3))
     return found
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchpt.core.errors import SceneError
 from torchpt.core.tree import leaves
-from torchpt.math.vectors import cross, dot, normalize
+from torchpt.math.vectors import cross, dot, normalize, side_by_side
 from torchpt.physics.parts import Copy, Part
 from torchpt.physics.shapes.geometry import KINDS, Geometry, Instances, Quadrics
 from torchpt.physics.shapes.primitive import PRIMITIVES, Corners, Primitive
@@ -258,11 +258,11 @@ def primitives_of(
         p0=p0,
         p1=p1,
         p2=p2,
-        e1=e1,
-        e2=e2,
+        e1=side_by_side(e1),
+        e2=side_by_side(e2),
         sign=sign,
-        normal=normal,
-        normals=normals,
+        normal=side_by_side(normal),
+        normals=normals and (side_by_side(normals[0]), side_by_side(normals[1]), side_by_side(normals[2])),
         bound=bound,
         frame=frame,
         quadrics=quadrics,

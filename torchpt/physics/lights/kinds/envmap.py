@@ -21,7 +21,7 @@ above the mean; a small lamp before an even sky is worth the compensation howeve
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -55,7 +55,7 @@ class Grid:
     """A density over the cells of a map, proportional to ``max(luminance - floor, 0)`` at the texels.
 
     Attributes:
-        cells: distribution of the cells, in float64.
+        cells: distribution of the cells.
         floor: ``()`` subtracted luminance; -1 for a black map, for a uniform density.
         factor: ``()`` factor from the interpolated difference to the density per steradian.
     """
@@ -129,23 +129,19 @@ def build(
     top = halves[0].diff()  # near the south pole the other one keeps its digits
     heights = torch.where(halves[0, 1:] < 0.5, top, -halves[1].diff())
     with torch.no_grad():
-        light = _luminances(texels)
-        zero = light.new_zeros(())
-        # A map may be large: what is not kept is overwritten.
-        room = Distribution2D.room(height - 1, width, light.device)
-        mean = sum_all(_weights(light, heights, room))
+        cells = _Cells(texels, heights)
+        zero = heights.new_zeros((), dtype=texels.dtype)
+        mean = cells.mean()
         black = not bool(mean > 0)
         compensated = plain = None
         if not black and compensation is not False:
-            floor = mean.to(light.dtype)
-            above = _weights(light, heights, room, floor)
-            if bool(sum_all(above) > 0) and (compensation or _uneven(above, mean, heights)):
-                compensated, room = _grid(above, floor), None
+            floor = mean.to(texels.dtype)
+            above, squares = cells.sums(floor)
+            if bool(above > 0) and (compensation or _uneven(above, squares, mean)):
+                compensated = cells.grid(floor, above)
         if alone or compensated is None:
             # With a floor of -1 every texel of a black map has the value 1: a uniform density.
-            values, floor = (torch.ones_like(light), zero - 1.0) if black else (light, zero)
-            room = Distribution2D.room(height - 1, width, light.device) if room is None else room
-            plain = _grid(_weights(values, heights, room), floor)
+            plain = cells.grid(zero - 1.0, heights.sum()) if black else cells.grid(zero, mean)
     return EnvironmentMap(
         texels=planes,
         height=height,
@@ -161,44 +157,59 @@ def build(
     )
 
 
-def _luminances(texels: Tensor) -> Tensor:
-    """Return the luminances ``(H, W)`` of texels ``(H, W, 3)``, at least 0."""
-    found = texels.new_empty(texels.shape[:2])
-    for rows, light in zip(texels.split(_ROWS), found.split(_ROWS), strict=True):  # a map may be large
-        torch.clamp_min(luminance(rows.movedim(-1, 0)), 0.0, out=light)
-    return found
+@dataclass(frozen=True)
+class _Cells:
+    """The cells of a map, which are computed some rows at a time: a map may be large.
 
-
-def _weights(values: Tensor, heights: Tensor, out: Tensor, floor: Tensor | None = None) -> Tensor:
-    """Return integrals over the cells of values ``(H, W)`` at the texels, in ``out``; the sphere has measure 1.
-
-    Args:
-        values: the values.
-        heights: differences of ``(1 - cos(theta)) / 2`` between the rows ``(H - 1,)``.
-        out: ``(H - 1, W)`` float64.
-        floor: ``()`` what counts is the excess over it; None: the values.
+    Attributes:
+        texels: ``(H, W, 3)``.
+        heights: differences of ``(1 - cos(theta)) / 2`` between the rows ``(H - 1,)`` float64.
     """
-    for first in range(0, len(out), _ROWS):  # a map may be large, and so would be what is between
-        block = out[first : first + _ROWS]
-        v = values[first : first + len(block) + 1]
-        v = (v if floor is None else (v - floor).clamp_min(0.0)).double()
-        v = v.roll(-1, 1).add_(v)
-        torch.add(v[:-1], v[1:], out=block)
-    return out.mul_(0.25).mul_((heights / values.shape[1])[:, None])
+
+    texels: Tensor
+    heights: Tensor
+
+    def weights(self, floor: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+        """Yield heights ``(n,)`` of rows of cells, and integrals over these cells ``(n, W)`` float64; the sphere has measure 1.
+
+        The integrand interpolates ``max(luminance - floor, 0)`` at the texels; luminances are at least 0.
+        """
+        for first in range(0, len(self.heights), _ROWS):
+            heights = self.heights[first : first + _ROWS]
+            light = luminance(self.texels[first : first + len(heights) + 1].movedim(-1, 0)).clamp_min_(0.0)
+            v = light.sub_(floor).clamp_min_(0.0).double()
+            v = v.roll(-1, 1).add_(v)
+            yield heights, (v[:-1] + v[1:]).mul_((heights * (0.25 / v.shape[1]))[:, None])
+
+    def mean(self) -> Tensor:
+        """Return the mean luminance ``()`` over the sphere, the sum of :meth:`weights` without a floor."""
+        # A texel is a corner of two cells of the row above, and of two of the row below.
+        shares = 0.5 * torch.nn.functional.pad(self.heights, (1, 1)).unfold(0, 2, 1).sum(1)
+        light = [luminance(rows.movedim(-1, 0)).clamp_min_(0.0).double().mean(1) for rows in self.texels.split(_ROWS)]
+        return sum_all(torch.cat(light) * shares)
+
+    def sums(self, floor: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the integrals ``()`` of :meth:`weights`' integrand over the sphere, and of its square."""
+        sums, squares = [], []
+        for heights, weights in self.weights(floor):
+            sums.append(sum_all(weights))
+            of_rows = torch.linalg.vector_norm(weights, dim=1).square()
+            squares.append(sum_all(of_rows * (weights.shape[1] / heights)))
+        return torch.stack(sums).sum(), torch.stack(squares).sum()
+
+    def grid(self, floor: Tensor, total: Tensor) -> Grid:
+        """Return the density by :meth:`weights`, whose sum is ``total``."""
+        rows = (weights for _, weights in self.weights(floor))
+        cells = Distribution2D.of(rows, len(self.heights), self.texels.shape[1], self.texels.device)
+        return Grid(cells=cells, floor=floor, factor=(1.0 / (4.0 * math.pi * total)).to(floor.dtype))
 
 
-def _uneven(weights: Tensor, mean: Tensor, heights: Tensor) -> bool:
-    """Return False for a near-constant map, see :data:`EVEN`; ``weights`` are integrals of the luminance above the mean."""
-    above = sum_all(weights)
-    squares = torch.linalg.vector_norm(weights, dim=1).square()  # of each row
-    spread = above * above / sum_all(squares * (weights.shape[1] / heights))
-    return bool((above > EVEN * mean) | (spread < EVEN))
+def _uneven(above: Tensor, squares: Tensor, mean: Tensor) -> bool:
+    """Return False for a near-constant map, see :data:`EVEN`.
 
-
-def _grid(weights: Tensor, floor: Tensor) -> Grid:
-    """Return the density of integrals over the cells, in which the sphere has measure 1; they are overwritten."""
-    factor = (1.0 / (4.0 * math.pi * sum_all(weights))).to(floor.dtype)
-    return Grid(cells=Distribution2D.within(weights), floor=floor, factor=factor)
+    ``above``, ``squares``: integrals of the luminance above the mean, and of its square.
+    """
+    return bool((above > EVEN * mean) | (above * above < EVEN * squares))
 
 
 def _cell_of(map: EnvironmentMap, d: Tensor) -> Cell:
