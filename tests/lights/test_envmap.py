@@ -357,7 +357,7 @@ def test_cells_are_drawn_by_their_weight(shape):
         weights[1] = 0.0
     chance = (weights / weights.sum()).flatten()
     u = torch.rand(2, N, generator=rng)
-    row, column, rest = Distribution2D.of(weights.split(2), *shape, weights.device).sample(u)
+    row, column, rest = Distribution2D.of(weights.split(2), shape[0], shape[1], weights.device).sample(u)
     assert int(column.min()) >= 0 and int(column.max()) < shape[1] and float(rest.min()) >= 0 and float(rest.max()) <= 1
     counts = torch.bincount(row * shape[1] + column, minlength=len(chance)).double()
     assert (counts[chance == 0] == 0).all()

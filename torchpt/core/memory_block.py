@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,18 +16,21 @@ __all__ = ["MemoryBlock", "common_block", "with_own_memory"]
 
 
 class MemoryBlock:
-    """A block of memory for ``size`` numbers in float32, filled by :meth:`add`."""
+    """A block of memory for ``size`` numbers in float32, filled by :meth:`add` and :meth:`reserve`."""
 
     def __init__(self, size: int) -> None:
         self._numbers, self._end = torch.empty(size, dtype=torch.float32), 0
 
     def add(self, array: NDArray[np.float32]) -> Tensor:
         """Return a tensor with the values of ``array``, after those that were added before."""
-        start, self._end = self._end, self._end + array.size
-        view = self._numbers[start : self._end].view(array.shape)
+        return self.reserve(array.shape).copy_(torch.from_numpy(array))
+
+    def reserve(self, shape: tuple[int, ...]) -> Tensor:
+        """Return a tensor of this shape, after those that were added before; nothing is written there yet."""
+        start, self._end = self._end, self._end + math.prod(shape)
+        view = self._numbers[start : self._end].view(shape)
         # A tensor of its own in the same memory: views share their count of changes in place.
-        added = torch.empty(0, dtype=torch.float32).set_(view.untyped_storage(), start, view.shape, view.stride())
-        return added.copy_(torch.from_numpy(array))
+        return torch.empty(0, dtype=torch.float32).set_(view.untyped_storage(), start, view.shape, view.stride())
 
 
 def common_block(tensors: Sequence[Tensor]) -> Tensor | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
@@ -21,8 +21,10 @@ from torchpt.spec import Refused
 
 __all__ = [
     "ACCEPTED_TEXELS",
+    "ByteImage",
     "Texels",
     "check_source",
+    "decoded_bytes",
     "has_alpha",
     "read_texels",
     "select_picture",
@@ -76,8 +78,7 @@ class Texels:
         """Return the first channels, decoded from sRGB; values of 8 bits by a table."""
         if self.white is None or self.white > 255:
             return srgb_to_linear(torch.from_numpy(np.ascontiguousarray(self.values[..., :channels]))).numpy()
-        numbers = np.arange(self.white + 1, dtype=np.float32) / np.float32(self.white)
-        table = srgb_to_linear(torch.from_numpy(numbers)).numpy()
+        table = decoded_bytes(encoded=True, white=self.white)
         linear = np.empty((*self.stored.shape[:2], channels), np.float32)
         rows = max(1, _BAND // max(1, linear[0].size))
         for first in range(0, len(linear), rows):
@@ -85,6 +86,67 @@ class Texels:
             numbers = self.stored[first : first + rows, :, :channels].astype(np.uint8)
             np.take(table, numbers, out=linear[first : first + rows], mode="clip")
         return linear
+
+    def as_bytes(self, encoded: bool) -> ByteImage | None:
+        """Return the image with its values as bytes; None where these are no bytes. Asked again it is the same object.
+
+        ``encoded``: whether colours are decoded from sRGB.
+        """
+        if self.white != 255 or self.stored.dtype != np.uint8:
+            return None
+        return self._byte_images.setdefault(encoded, ByteImage(self.stored, encoded))
+
+    @cached_property
+    def _byte_images(self) -> dict[bool, ByteImage]:
+        return {}
+
+
+def decoded_bytes(encoded: bool, white: int = 255) -> NDArray[np.float32]:
+    """Return what the whole numbers ``0 .. white`` stand for ``(white + 1,)``; ``encoded``: they are sRGB."""
+    numbers = np.arange(white + 1, dtype=np.float32) / np.float32(white)
+    return srgb_to_linear(torch.from_numpy(numbers)).numpy() if encoded else numbers
+
+
+@dataclass(eq=False)
+class ByteImage:
+    """An image of 8 bits a value that stands for its values ``(H, W, C)`` in float32.
+
+    Attributes:
+        stored: ``(H, W, C)`` uint8.
+        encoded: True: colours are decoded from sRGB. The last of 2 or 4 channels, alpha, is not.
+        needs_floats: True: someone reads the values in another way than texel by texel.
+    """
+
+    stored: NDArray[np.uint8]
+    encoded: bool
+    needs_floats: bool = False
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Return H, W and C."""
+        height, width, channels = self.stored.shape
+        return height, width, channels
+
+    def values(self) -> NDArray[np.float32]:
+        """Return the values ``(H, W, C)``."""
+        texels = Texels(self.stored, eight_bit=True, white=255)
+        return texels.decoded if self.encoded else texels.values
+
+    def min(self) -> float:
+        """Return the least value."""
+        return self._extreme(np.min)
+
+    def max(self) -> float:
+        """Return the greatest value."""
+        return self._extreme(np.max)
+
+    def _extreme(self, of: Callable[..., Any]) -> float:
+        channels = self.shape[2]
+        colours = channels - (1 if channels in (2, 4) else 0)
+        found = [decoded_bytes(self.encoded)[of(self.stored[..., :colours])]]
+        if colours < channels:
+            found.append(decoded_bytes(encoded=False)[of(self.stored[..., colours:])])
+        return float(of(found))
 
 
 def read_texels(source: str | PathLike[str] | EncodedImage, max_pixels: int = MAX_PIXELS) -> Texels:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from torchpt.core.tree import NOT_FINGERPRINTED
+from torchpt.images import ByteImage
 from torchpt.physics.bsdfs.resolved import ResolvedMaterial
 from torchpt.physics.shapes.quadrics import Quadric
 from torchpt.physics.textures import Node
@@ -29,18 +30,27 @@ class Parameters(dict[str, np.ndarray]):
     Attributes:
         specs: the spec of each parameter by name.
         texels_in_scene: names of parameters whose texels are given in the scene, not in an image file.
+        images: by name those whose values stand in an image that is not decoded yet; their arrays have shapes alone.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.specs: dict[str, Spec] = {}
         self.texels_in_scene: set[str] = set()
+        self.images: dict[str, ByteImage] = {}
 
     def declare(self, name: str, value: Any, spec: Spec) -> None:
-        """Add a parameter, in float64 unless it is a float32 array (texels)."""
+        """Add a parameter, in float64 unless it is a float32 array, or an image in place of one (texels)."""
+        if isinstance(value, ByteImage):
+            self.images[name] = value
+            value = np.broadcast_to(np.float32(0.0), value.shape)  # takes no memory
         is_texels = isinstance(value, np.ndarray) and value.dtype == np.float32
         self[name] = value if is_texels else np.asarray(value, np.float64)
         self.specs[name] = spec
+
+    def decoded(self, name: str) -> np.ndarray:
+        """Return the values of a parameter."""
+        return self.images[name].values() if name in self.images else self[name]
 
     def declare_all(self, prefix: str, kind: Any, values: Mapping[str, Any]) -> None:
         """Add the differentiable parameters of a kind that have a value; ``transform`` becomes ``to_world``."""

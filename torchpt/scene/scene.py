@@ -28,6 +28,7 @@ from torchpt.core.memory import MemoryMeter, mb, retry_out_of_memory, trim_heap
 from torchpt.core.memory_block import MemoryBlock, with_own_memory
 from torchpt.core.threads import outside_inference_mode, warm_up
 from torchpt.core.tree import moved
+from torchpt.images import PackedImages
 from torchpt.physics.bsdfs import Bsdf
 from torchpt.physics.cameras import Camera
 from torchpt.physics.cameras.opencv import PinholeMatrices, extrinsics
@@ -53,7 +54,7 @@ from torchpt.spec import Moves, Pose, Refused, Spec, parameters_of
 __all__ = ["Scene", "live_scenes", "scene_by_number"]
 
 #: Attributes that copies take over; all others are rebuilt on demand.
-_COPIED_ATTRIBUTES = ("description", "device", "own_models", "params", "load_seconds", "peak", "_built")
+_COPIED_ATTRIBUTES = ("description", "device", "own_models", "_tensors", "load_seconds", "peak", "_built")
 
 _numbers = itertools.count(1)
 #: All live scenes by number.
@@ -83,10 +84,6 @@ class Scene:
         device: device of the parameters.
         own_models: BSDFs of the caller.
         load_seconds: seconds of loading, files included; 0 where it was not measured.
-        params: every tensor by dotted name (``materials.*``, ``shapes.*``, ``lights.*``, ``camera.*``): colours ``(3,)``,
-            vertices ``(V, 3)`` in the mesh's own space, poses ``(4, 4)``. Changes in place take effect at the next
-            render, which checks them like a scene file; to differentiate, pass replacements to
-            ``torchpt.render(scene, params=...)``.
     """
 
     def __init__(
@@ -108,19 +105,25 @@ class Scene:
         # A centre other than 0 means that the scene lies far from its origin. Then positions stay in float64: float32 would
         # lose detail before they are moved to the origin.
         far = bool(self._built.centre.any())
-        self.params: dict[str, Tensor] = {}
+        self._tensors: dict[str, Tensor] = {}
         parameters = self._built.parameters
         # Texels may be large: they are kept once, where a world reads them.
         block = MemoryBlock(sum(value.size for value in parameters.values() if value.dtype == np.float32))
+        images, parameters.images = parameters.images, {}
+        unread = {name for name, image in images.items() if device.type == "cpu" and not image.needs_floats}
         for name, value in parameters.items():
             positions = far and self.spec(name).holds_positions
             if value.dtype == np.float32:
-                tensor = block.add(value)
+                values = images[name].values() if name in images and name not in unread else value
+                tensor = block.reserve(value.shape) if name in unread else block.add(values)
                 parameters[name] = tensor.numpy()
             else:
                 with np.errstate(over="ignore"):  # infinite in float32: the check of the world says so
                     tensor = torch.from_numpy(value.astype(np.float64 if positions else np.float32, order="C"))
-            self.params[name] = tensor.to(device)
+            self._tensors[name] = tensor.to(device)
+        packed = images if unread else {}
+        self._packed = PackedImages(packed, {name: self._tensors[name] for name in unread})
+        del images, packed
         trim_heap()  # of files as they were read
         after = meter.peak()
         #: Peak bytes while the scene was read, above those after import; 0 where unknown, and where no new peak was reached.
@@ -133,9 +136,9 @@ class Scene:
         self._host_space = Space(torch.from_numpy(self._built.centre), self._built.unit)
         self._space = moved(self._host_space, self.device)
         self._host_copies = HostCopies()
-        self._sized_shapes = sized_shapes(self.description, self.params)
+        self._sized_shapes = sized_shapes(self.description, self._tensors)
         self._size_names = frozenset(name for shape in self._sized_shapes for name in shape.names)
-        self._unchanged_sizes = unchanged_sizes(self._sized_shapes, self.params)
+        self._unchanged_sizes = unchanged_sizes(self._sized_shapes, self._tensors)
         self._lock = threading.RLock()
         # By dtype, whether texture coordinates were asked for, light sampler, and whether lights are sampled alone.
         self._worlds: dict[tuple[torch.dtype, bool, str, bool], tuple[World, Geometry]] = {}
@@ -161,6 +164,27 @@ class Scene:
         _scenes[self.number] = self
 
     @property
+    def params(self) -> dict[str, Tensor]:
+        """Return every tensor by dotted name (``materials.*``, ``shapes.*``, ``lights.*``, ``camera.*``).
+
+        Colours are ``(3,)``, vertices ``(V, 3)`` in the mesh's own space, poses ``(4, 4)``. Changes in place take effect at the
+        next render, which checks them like a scene file; to differentiate, pass replacements to ``torchpt.render(scene,
+        params=...)``. Images of 8 bits a value are decoded when this is first asked for.
+        """
+        if self._packed.unpack():
+            self._pieces.clear()  # those of packed images
+        return self._tensors
+
+    def take(self, params: Mapping[str, Tensor]) -> None:
+        """Take tensors in place of parameters as they were loaded."""
+        self._tensors.update(params)
+
+    @property
+    def tensors(self) -> Mapping[str, Tensor]:
+        """Return :attr:`params` for names, shapes and versions: images may not be decoded yet."""
+        return self._tensors
+
+    @property
     def origin(self) -> Scene:
         """Return the scene that this is a view of (:meth:`seen_by`), else itself; caches belong to it."""
         return self if self._origin is None else self._origin
@@ -179,7 +203,7 @@ class Scene:
         view = object.__new__(type(self))
         with outside_inference_mode():
             view_state = view_attributes(
-                self.description, self._built, self.params, camera, {} if film is None else film
+                self.description, self._built, self._tensors, camera, {} if film is None else film
             )
         view.__dict__.update(self.__dict__ | view_state)  # the caches are shared, not copied
         view._origin = self.origin
@@ -212,7 +236,7 @@ class Scene:
     def _copied(self, device: torch.device, params: dict[str, Tensor], memo: dict[int, Any] | None) -> Scene:
         """Return another scene of other parameters; with a ``memo`` of ``copy.deepcopy`` the caller's BSDFs are copied too."""
         made = object.__new__(type(self))
-        state = self.__dict__ | {"device": device, "params": params, "peak": 0}
+        state = self.__dict__ | {"device": device, "_tensors": params, "peak": 0}
         if memo is not None and self.own_models:
             state |= copy.deepcopy({name: state[name] for name in ("description", "_built", "own_models")}, memo)
             # `held` returns the torch modules of a BSDF.
@@ -224,11 +248,12 @@ class Scene:
     def __getstate__(self) -> dict[str, Any]:
         """Return the state to pickle; unpickling reads no files."""
         state = {name: getattr(self, name) for name in _COPIED_ATTRIBUTES}
-        return state | {"params": {name: with_own_memory(_leaf(value)) for name, value in self.params.items()}}
+        return state | {"_tensors": {name: with_own_memory(_leaf(value)) for name, value in self.params.items()}}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         warm_up()
         self.__dict__.update(state)
+        self._packed = PackedImages({}, {})
         self._reset_caches()
 
     def weights(self) -> tuple[Tensor, ...]:
@@ -249,14 +274,14 @@ class Scene:
         primitives = sum(part.primitive_count for part in parts)
         return (
             f"Scene({self.name or 'of a mapping'}: {width} x {height}, {shapes} shapes, {primitives} primitives, "
-            f"{len(self.params)} parameters, {self.device})"
+            f"{len(self._tensors)} parameters, {self.device})"
         )
 
     @property
     def size_phrase(self) -> str:
         """Return a phrase about the scene's size, for errors."""
-        triangles = sum(len(value) for name, value in self.params.items() if name.endswith(".vertices"))
-        held = sum(value.numel() * value.element_size() for value in self.params.values())
+        triangles = sum(len(value) for name, value in self._tensors.items() if name.endswith(".vertices"))
+        held = sum(value.numel() * value.element_size() for value in self._tensors.values())
         return f"{len(self._built.parts)} parts with {triangles} vertices, whose parameters alone take {mb(held)}"
 
     def drop_pieces(self) -> None:
@@ -301,10 +326,10 @@ class Scene:
         if params is not None and not isinstance(params, Mapping):
             raise SceneError("params", params, "a mapping from names of scene.params to tensors")
         for name, value in (params or {}).items():
-            if name not in self.params:
-                examples = example_names(str(name), list(self.params))
+            if name not in self._tensors:
+                examples = example_names(str(name), list(self._tensors))
                 raise SceneError(f"params.{name}", name, f"a parameter of this scene such as {examples}")
-            check_tensor(name, value, self.params[name].shape, texels=self.spec(name).texture)
+            check_tensor(name, value, self._tensors[name].shape, texels=self.spec(name).texture)
             self.check_number(name, value.detach())
         merged = self.merged(params)
         check_light_params(self._built.sources, params or {}, merged)
@@ -325,14 +350,14 @@ class Scene:
 
     def versions(self) -> dict[str, int]:
         """Return version numbers of :attr:`params` by name; see :class:`torchpt.scene.versions.VersionCounter`."""
-        return self._version_counter.of(self.params)
+        return self._version_counter.of(self._tensors)
 
     def merged(self, params: Mapping[str, Tensor] | None) -> dict[str, Tensor]:
         """Return all parameters, with those of ``params`` (checked before) in place of the scene's.
 
         Poses of shapes whose sizes have changed (:mod:`torchpt.scene.sizes`) are those of their primitives.
         """
-        merged = {**self.params, **{name: value.to(self.device) for name, value in (params or {}).items()}}
+        merged = {**self._tensors, **{name: value.to(self.device) for name, value in (params or {}).items()}}
         # Autograd refuses tensors of torch.inference_mode, but not their clones.
         merged = {name: value.clone() if value.is_inference() else value for name, value in merged.items()}
         return with_poses(merged, self._sized_shapes, self._unchanged_sizes)
@@ -452,7 +477,7 @@ class Scene:
         """Return the camera on a film, in the coordinates of lanes. It is computed on the host, see :meth:`_assemble`."""
         camera, values = self.description.camera, dict(self.description.camera.values)
         params = {name: value for name, value in params.items() if name.startswith("camera.")}
-        params = self._host_copies.of(params, self.params)
+        params = self._host_copies.of(params, self._tensors)
         for key, spec in parameters_of(camera.kind).items():
             value = params.get(f"camera.{key}")
             if spec.differentiable and value is not None:
@@ -531,9 +556,13 @@ class Scene:
         torch's operators round differently on a GPU, and a ray that then takes another way changes the picture. Tensors that
         are a parameter as it is, such as texels, are not copied.
         """
-        host = self._host_copies.of(params, self.params)
-        own = frozenset(name for name, value in params.items() if self.params.get(name) is value)
-        reads = ParameterReads(host, self._pieces, own, variant=(dtype, uv))
+        packed = self._packed.found()
+        if any(params[name] is not self._tensors.get(name) for name in packed):
+            packed = {}
+            _ = self.params  # all images by their numbers
+        host = self._host_copies.of(params, self._tensors)
+        own = frozenset(name for name, value in params.items() if self._tensors.get(name) is value)
+        reads = ParameterReads(host, self._pieces, own, variant=(dtype, uv), packed=packed)
         built, space = self._built, self._host_space
         made = assemble(
             built.parts,
@@ -553,14 +582,14 @@ class Scene:
 
     def _refresh(self) -> None:
         """Clear the caches where a parameter other than the camera's was replaced or changed in place."""
-        now, before = self._cache_counter.of(self.params), self._cached_versions.copy()
+        now, before = self._cache_counter.of(self._tensors), self._cached_versions.copy()
         changed = changed_versions(before, now)
         gone = any(name not in now and not name.startswith("camera.") for name in before)
         if not changed and not gone:
             return
         for name in changed:
             if self.spec(name).holds_positions and name in before:  # moved: it may lie out of reach now
-                self.check_number(name, self.params[name].detach())
+                self.check_number(name, self._tensors[name].detach())
         self._cached_versions.clear()
         self._cached_versions.update(now)
         if not gone and all(name.startswith("camera.") for name in changed):  # nothing in the caches depends on it

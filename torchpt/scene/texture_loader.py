@@ -119,7 +119,7 @@ class TextureLoader:
         """Return a number texture as a function from texture coordinates ``(V, 2)`` to values ``(V,)``, float64."""
         own = Parameters()  # used once to displace the mesh: no parameters of the scene
         node = self._open(slot, key, key, own).unfiltered()
-        tensors = {name: torch.from_numpy(value) for name, value in own.items()}
+        tensors = {name: torch.from_numpy(own.decoded(name)) for name in own}
         table = node.table([node], tensors, torch.float64, torch.device("cpu"))  # the node is row 0
 
         def look_up(uvs: np.ndarray) -> np.ndarray:

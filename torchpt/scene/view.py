@@ -69,5 +69,5 @@ def view_attributes(
     return {
         "description": description,
         "_built": built,
-        "params": view_params | params_from_tensors(tensors, description, built, view_params),
+        "_tensors": view_params | params_from_tensors(tensors, description, built, view_params),
     }

@@ -32,7 +32,7 @@ def left_out(scene: Scene, settings: Settings, params: Mapping[str, Tensor] | No
 
 def _found(scene: Scene, settings: Settings, params: Mapping[str, Tensor]) -> Iterator[str]:
     built, camera = scene.built, scene.description.camera.kind
-    if scene.camera(settings.film, scene.params, torch.float64).film_of(_point(scene.device)) is None:
+    if scene.camera(settings.film, scene.tensors, torch.float64).film_of(_point(scene.device)) is None:
         yield f"those that a camera of kind {camera.name} sees"
     materials = [owner.material for owner in (*built.parts, *built.copies)]
     if any(is_mirror(part, params) for material in materials for part in material.with_inner()):

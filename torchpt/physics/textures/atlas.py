@@ -5,6 +5,9 @@ how it is read: channel, wrap mode, filter, transform of texture coordinates. Te
 is ``v = 0`` (Mitsuba). All nodes that read images are rows of one table, the :class:`Atlas`, which stages look up on lanes: N
 points at once, each with its own node. Nodes that read luminances, which are computed, have an atlas of their own.
 
+Images of 8 bits a value may be *packed*, one number of 32 bits a texel; nodes that read them are a table of their own. Its
+look-ups decode the bytes by a table, and give the same values.
+
 A filtered node has a mipmap (Williams, *Pyramidal Parametrics*, 1983). Each level is another node with the same settings, and
 a look-up interpolates between the two levels whose texels are about as large as the footprint.
 """
@@ -22,8 +25,17 @@ from torch import Tensor
 
 from torchpt.core.memory_block import common_block
 from torchpt.core.threads import mean_all
+from torchpt.images import PackedTexels, decode_table
 from torchpt.math.vectors import luminance, take
-from torchpt.physics.textures.base import IDENTITY, Matrix, Node, Table, TexturePoint, transform_uv
+from torchpt.physics.textures.base import (
+    IDENTITY,
+    Matrix,
+    Node,
+    Table,
+    TexelSource,
+    TexturePoint,
+    transform_uv,
+)
 
 __all__ = ["WRAPS", "Atlas", "ImageNode", "Mipmaps", "atlas_of", "look_up", "slope"]
 
@@ -46,6 +58,7 @@ class ImageNode(Node):
         scale: factors of the three channels (the first for a number).
         filtered: whether footprints larger than a texel read levels of a mipmap.
         compute: function that makes the image ``(H, W, C)`` from the parameters and ``texels``; None: it is a parameter.
+        packed: whether the image may be packed.
     """
 
     texels: str
@@ -56,11 +69,12 @@ class ImageNode(Node):
     scale: tuple[float, float, float]
     filtered: bool = False
     compute: Callable[[Mapping[str, Tensor], str], Tensor] | None = None
+    packed: bool = False
 
     @property
     def variant(self) -> Hashable:
         """See :attr:`Node.variant`."""
-        return Atlas, self.channel == -1
+        return Atlas, self.channel == -1, self.packed
 
     def divided(self, unit: float) -> ImageNode:
         """See :meth:`Node.divided`."""
@@ -76,6 +90,10 @@ class ImageNode(Node):
     ) -> Table:
         """See :meth:`Node.table`."""
         by_image = {node.texels: node for node in reversed(nodes)}  # of equal names the first node counts
+        if self.packed and isinstance(parameters, TexelSource):
+            packed = {name: image for name in by_image if (image := parameters.packed(name)) is not None}
+            if len(packed) == len(by_image):
+                return _packed_atlas_of(nodes, packed, dtype, device)
         return atlas_of(nodes, {name: node.image(parameters) for name, node in by_image.items()}, dtype, device)
 
     def mean(self, parameters: Mapping[str, Tensor]) -> Tensor:
@@ -107,14 +125,16 @@ class Atlas(Table):
     """All images, and the M nodes that read them, levels of mipmaps included.
 
     Attributes:
-        texels: ``(T,)`` numbers of all images.
+        texels: ``(T,)`` numbers of all images; of packed ones int32, the first channel in the lowest byte.
         layouts: ``(7, M)`` int64: first number, stride between texels, stride between channels (0: one serves all), width,
-            height, code of the wrap mode, 1 if bilinear.
+            height, code of the wrap mode, 1 if bilinear. Of packed images ``(9, M)``: the stride between channels is in bits,
+            and the last two rows are the first channel's place in bits, and where its bytes begin in ``decode``.
         transforms: ``(9, M)``: rows of the transform of texture coordinates, then ``scale``.
         wraps: wrap modes in use; static.
         scaled: whether any node scales; static.
         transformed: whether any node transforms texture coordinates; static.
         mipmaps: None if no node is filtered.
+        decode: ``(512,)`` what bytes stand for, see :func:`torchpt.images.decode_table`; None: images are not packed.
     """
 
     texels: Tensor
@@ -124,6 +144,7 @@ class Atlas(Table):
     scaled: bool
     transformed: bool
     mipmaps: Mipmaps | None = None
+    decode: Tensor | None = None
 
     @property
     def count(self) -> int:
@@ -165,13 +186,13 @@ def atlas_of(nodes: Sequence[ImageNode], images: dict[str, Tensor], dtype: torch
     texels, places = _stored([level for levels in levels_of.values() for level in levels], dtype, device)
     rest = iter(places)
     layouts_of = {source: [next(rest) for _ in levels] for source, levels in levels_of.items()}
-    layouts, transforms, coarser = [], [], []  # coarser: layouts of the levels above 0 of each node
+    layouts, coarser = [], []  # coarser: layouts of the levels above 0 of each node
     for node in nodes:
-        modes = [WRAPS.index(node.wrap), 0 if node.nearest else 1]
+        modes = _modes(node)
         finest, *others = layouts_of[node.texels, node.channel]
         layouts.append([*finest, *modes])
-        transforms.append([*node.transform[0], *node.transform[1], *node.scale])
         coarser.append([[*level, *modes] for level in others] if node.filtered else [])
+    transforms = [_transform_and_scale(node) for node in nodes]
     mipmaps = None
     if filtered:
         counts = torch.tensor([len(levels) for levels in coarser], dtype=torch.int64)
@@ -190,11 +211,48 @@ def atlas_of(nodes: Sequence[ImageNode], images: dict[str, Tensor], dtype: torch
         texels=texels,
         layouts=torch.tensor(layouts, dtype=torch.int64, device=device).T.contiguous(),
         transforms=torch.tensor(transforms, dtype=dtype, device=device).T.contiguous(),
-        wraps=tuple(wrap for wrap in WRAPS if any(node.wrap == wrap for node in nodes)),
-        scaled=any(node.scale != (1.0, 1.0, 1.0) for node in nodes),
-        transformed=any(node.transform != IDENTITY for node in nodes),
         mipmaps=mipmaps,
+        **_static(nodes),
     )
+
+
+def _packed_atlas_of(
+    nodes: Sequence[ImageNode], images: Mapping[str, PackedTexels], dtype: torch.dtype, device: torch.device
+) -> Atlas:
+    """Build the atlas of nodes whose images are packed, all in the same memory; arguments as for :func:`atlas_of`."""
+    layouts = []
+    for node in nodes:
+        image, channel = images[node.texels], node.channel or 0
+        step = 8 if node.channel is None and image.channels >= 3 else 0
+        alpha = image.channels in (2, 4) and node.channel == image.channels - 1
+        place = [8 * channel, 256 if image.encoded and not alpha else 0]
+        layouts.append([image.first, 1, step, image.width, image.height, *_modes(node), *place])
+    return Atlas(
+        texels=images[nodes[0].texels].words.to(device),
+        layouts=torch.tensor(layouts, dtype=torch.int64, device=device).T.contiguous(),
+        transforms=torch.tensor(list(map(_transform_and_scale, nodes)), dtype=dtype, device=device).T.contiguous(),
+        decode=decode_table().to(device=device, dtype=dtype),
+        **_static(nodes),
+    )
+
+
+def _modes(node: ImageNode) -> list[int]:
+    """Return the code of the wrap mode, and 1 if bilinear."""
+    return [WRAPS.index(node.wrap), 0 if node.nearest else 1]
+
+
+def _transform_and_scale(node: ImageNode) -> list[float]:
+    """Return a row of :attr:`Atlas.transforms`."""
+    return [*node.transform[0], *node.transform[1], *node.scale]
+
+
+def _static(nodes: Sequence[ImageNode]) -> dict[str, Any]:
+    """Return the static attributes of :class:`Atlas`."""
+    return {
+        "wraps": tuple(wrap for wrap in WRAPS if any(node.wrap == wrap for node in nodes)),
+        "scaled": any(node.scale != (1.0, 1.0, 1.0) for node in nodes),
+        "transformed": any(node.transform != IDENTITY for node in nodes),
+    }
 
 
 def _stored(levels: Sequence[Tensor], dtype: torch.dtype, device: torch.device) -> tuple[Tensor, list[list[int]]]:
@@ -354,17 +412,32 @@ def _corners(atlas: Atlas, node: Tensor, uv: Tensor, *, coloured: bool) -> _Corn
     left, right = (_wrapped(atlas.wraps, k, width, wrap) * texel_stride for k in (i, i + 1))
     row = width * texel_stride
     top, bottom = (first + _wrapped(atlas.wraps, k, height, wrap) * row for k in (j, j + 1))
-    if not coloured:
-        a, b, c, d = (take(atlas.texels, row + column) for row in (top, bottom) for column in (left, right))
+    places = (row + column for row in (top, bottom) for column in (left, right))
+    # All channels of all lanes by one look-up, (3 N,).
+    steps = torch.arange(3, device=node.device)[:, None] * channel_stride if coloured else None
+    if atlas.decode is not None:
+        a, b, c, d = (_decoded(atlas, take(atlas.texels, place), layout[7], layout[8], steps) for place in places)
+    elif steps is None:
+        a, b, c, d = (take(atlas.texels, place) for place in places)
     else:
-        # All channels of all lanes by one look-up, (3 N,).
-        steps = torch.arange(3, device=node.device)[:, None] * channel_stride
-        a, b, c, d = (
-            take(atlas.texels, (steps + (row + column)).reshape(-1)).view(3, -1)
-            for row in (top, bottom)
-            for column in (left, right)
-        )
+        a, b, c, d = (take(atlas.texels, (steps + place).reshape(-1)).view(3, -1) for place in places)
     return _Corners(low=(a, b), high=(c, d), x=x, y=y, width=columns, height=rows, blend=blend, transforms=transforms)
+
+
+def _decoded(atlas: Atlas, word: Tensor, place: Tensor, start: Tensor, steps: Tensor | None) -> Tensor:
+    """Return the values of packed texels ``(N,)``, or three channels of each.
+
+    Args:
+        atlas: with ``decode``.
+        word: the texels.
+        place: ``(N,)`` the first channel's, in bits.
+        start: ``(N,)`` where its bytes begin in ``decode``.
+        steps: ``(3, N)`` between channels, in bits; None: one channel.
+    """
+    assert atlas.decode is not None
+    if steps is None:
+        return take(atlas.decode, ((word >> place) & 255) + start)
+    return take(atlas.decode, (((word >> (place + steps)) & 255) + start).reshape(-1)).view(3, -1)
 
 
 def _wrapped(wraps: tuple[str, ...], index: Tensor, size: Tensor, code: Tensor) -> Tensor:

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from torchpt.core.errors import SceneError
 from torchpt.core.threads import ReadAhead
+from torchpt.images import ByteImage, PackedTexels
 from torchpt.math.transforms import uv_matrix
 from torchpt.spec import Angle, Color, Custom, Moves, Pair, Refused, Spec, parameters_of
 from torchpt.spec.reading import LARGEST, as_refused, vector
@@ -28,8 +29,8 @@ if TYPE_CHECKING:
     from torchpt.physics.parts import Parameters
 
 __all__ = [
-    "CHANNELS", "IDENTITY", "Find", "Mapped", "Matrix", "Node", "Opening", "Table", "Texture", "TextureInput", "TexturePoint",
-    "TextureReference", "UvTransform", "transform_uv",
+    "CHANNELS", "IDENTITY", "Find", "Mapped", "Matrix", "Node", "Opening", "Table", "TexelSource", "Texture", "TextureInput",
+    "TexturePoint", "TextureReference", "UvTransform", "transform_uv",
 ]  # fmt: skip
 
 #: Channels from which a number may be read. A node holds the index minus 1: -1 for luminance, else the component of a texel.
@@ -87,6 +88,14 @@ class TexturePoint:
     def unfiltered(self) -> TexturePoint:
         """The points without footprints."""
         return self if self.footprint is None else replace(self, footprint=None)
+
+
+class TexelSource(Mapping[str, Tensor]):
+    """The parameters of a scene by dotted name, some of whose images may be packed."""
+
+    def packed(self, name: str) -> PackedTexels | None:
+        """Return an image packed; None for one that is not."""
+        raise NotImplementedError
 
 
 class Table:
@@ -231,7 +240,9 @@ class Opening:
                 spec = self.restricted(spec)
             self.declare(name, values[key], replace(spec, moves=self.slot.moves))
 
-    def check(self, values: np.ndarray, key: str, label: str = "", scale: tuple[float, float, float] = _ONE) -> None:
+    def check(
+        self, values: np.ndarray | ByteImage, key: str, label: str = "", scale: tuple[float, float, float] = _ONE
+    ) -> None:
         """Refuse values, times ``scale``, that the slot does not accept.
 
         Raises:

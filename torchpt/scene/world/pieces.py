@@ -21,6 +21,8 @@ import torch
 from torch import Tensor
 
 from torchpt.core.autograd import transforms_are_active
+from torchpt.images import PackedTexels
+from torchpt.physics.textures import TexelSource
 
 __all__ = ["KeptPieces", "ParameterReads", "passing_piece", "piece"]
 
@@ -70,7 +72,7 @@ class KeptPieces:
         self._pieces.clear()
 
 
-class ParameterReads(Mapping[str, Tensor]):
+class ParameterReads(TexelSource):
     """The parameters of one assembly, which records what pieces read.
 
     Args:
@@ -78,6 +80,7 @@ class ParameterReads(Mapping[str, Tensor]):
         kept: pieces of earlier assemblies; None: nothing is kept.
         own: names of the scene's own parameters, which live as long as the scene.
         variant: what pieces depend on beside parameters.
+        packed: images of the scene's own that are packed, and whose tensors have no numbers yet; all of them or none.
     """
 
     def __init__(
@@ -86,8 +89,10 @@ class ParameterReads(Mapping[str, Tensor]):
         kept: KeptPieces | None = None,
         own: frozenset[str] = frozenset(),
         variant: Hashable = (),
+        packed: Mapping[str, PackedTexels] | None = None,
     ) -> None:
-        self._parameters, self._own, self._variant = parameters, own, variant
+        self._parameters, self._own = parameters, own
+        self._packed, self._variant = packed or {}, (variant, bool(packed))
         # Tensors that are made inside of a transform of `torch.func` belong to it, those of inference mode to that mode.
         usable = not transforms_are_active() and not torch.is_inference_mode_enabled()
         self._kept = kept if usable else None
@@ -100,12 +105,21 @@ class ParameterReads(Mapping[str, Tensor]):
     def __getitem__(self, name: str) -> Tensor:
         if self._reads:
             self._reads[-1].add(name)
+        if name in self._packed:
+            return torch.from_numpy(self._packed[name].values())
         state = None if self._kept is None or name in self._own else self._state(name)
         if state is None:
             return self._parameters[name]
         if name not in self._copies:  # a kept piece must not change with a caller's tensor
             self._copies[name] = self._parameters[name].detach().clone()
         return self._copies[name]
+
+    def packed(self, name: str) -> PackedTexels | None:
+        """Return an image packed; None for one that is not."""
+        found = self._packed.get(name)
+        if self._reads and found is not None:
+            self._reads[-1].add(name)
+        return found
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._parameters)

@@ -15,7 +15,7 @@ import numpy as np
 
 from torchpt.core.errors import AssetError, SceneError
 from torchpt.core.threads import ReadAhead
-from torchpt.images import EncodedImage, Texels, read_texels
+from torchpt.images import ByteImage, EncodedImage, Texels, read_texels
 from torchpt.images.decode import MAX_PIXELS
 from torchpt.images.texels import ACCEPTED_TEXELS, check_source, texels_from_array
 from torchpt.physics.textures.atlas import WRAPS, ImageNode
@@ -120,7 +120,6 @@ class Image(Mapped):
             raise SceneError(f"{opening.name}.scale", list(scale), expected, opening.file)
         if values["clamp"]:
             picture, decode = _clamped(picture, label, scale, opening, decode=decode), False
-        name = _declare_texels(opening, label, picture, scale, decode=decode, alpha=alpha)
         index = None
         if not slot.coloured:  # the channel's index among the texels; -1: luminance
             grey = channels < 3
@@ -131,15 +130,21 @@ class Image(Mapped):
                 "b": 0 if grey else 2,
                 "a": channels - 1,
             }[channel]
-        return ImageNode(
+        name, texels = _declare_texels(opening, label, picture, scale, decode=decode, alpha=alpha)
+        filtered = values["filter"] in cls.filters  # the values that average over footprints
+        node = ImageNode(
             texels=name,
             channel=index,
             wrap=values["wrap"],
             nearest=values["filter"] == "nearest",
             transform=cls.matrix(values),
             scale=scale,
-            filtered=values["filter"] in cls.filters,  # the values that average over footprints
+            filtered=filtered,
+            packed=isinstance(texels, ByteImage) and index != -1 and not filtered,
         )
+        if isinstance(texels, ByteImage):
+            texels.needs_floats |= not node.packed  # levels of mipmaps and luminances are no bytes
+        return node
 
 
 def _read_image(values: Mapping[str, Any], opening: Opening) -> tuple[str, Texels]:
@@ -186,14 +191,16 @@ def _is_encoded(picture: Texels, colorspace: str, *, linear: bool) -> bool:
 def _read_converted(path: FilePath, max_pixels: int, colorspace: str, *, linear: bool) -> Texels:
     """Read an image, and convert its values as a slot wants them; arguments as for :func:`_is_encoded`."""
     picture = read_texels(path, max_pixels)
-    _ = picture.decoded if _is_encoded(picture, colorspace, linear=linear) else picture.values
+    decode = _is_encoded(picture, colorspace, linear=linear)
+    if picture.as_bytes(decode) is None:
+        _ = picture.decoded if decode else picture.values
     return picture
 
 
 def _declare_texels(
     opening: Opening, label: str, picture: Texels, scale: tuple[float, float, float], *, decode: bool, alpha: bool
-) -> str:
-    """Declare an image's texels as a parameter, and return its name.
+) -> tuple[str, np.ndarray | ByteImage]:
+    """Declare an image's texels as a parameter; return its name, and the texels.
 
     Args:
         opening: the slot.
@@ -203,12 +210,18 @@ def _declare_texels(
         decode: whether colours are decoded from sRGB.
         alpha: whether the slot reads the alpha channel: then either form will do, as alpha is the same in both.
     """
-    texels = picture.decoded if decode else picture.values
+    texels: Any = picture.as_bytes(decode)
+    if texels is None:
+        texels = picture.decoded if decode else picture.values
     name, parameters = opening.name, opening.parameters
-    if name in parameters and parameters[name] is not texels and not alpha:
+
+    def declared(name: str) -> Any:
+        return parameters.images.get(name, parameters.get(name))
+
+    if name in parameters and declared(name) is not texels and not alpha:
         name += ".decoded" if decode else ".stored"  # an image for both colours and numbers has two sets of texels
     if name in parameters:
-        texels = parameters[name]
+        texels = declared(name)
     opening.check(texels, opening.key, label, scale)
     # The slack admits rounding at the bounds.
     spec = TexelsSpec(low=None, slack=1e-6, moves=opening.slot.moves, doc="texels `(H, W, C)`, linear")
@@ -216,4 +229,4 @@ def _declare_texels(
     # Texels of `data` stand in the scene, not in a file: meshes that read them need texture coordinates.
     if label == f"{opening.name}.data":
         opening.parameters.texels_in_scene.add(name)
-    return name
+    return name, texels

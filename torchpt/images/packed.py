@@ -1,0 +1,89 @@
+"""Images of 8 bits a value that stay so in memory: a texel is one number of 32 bits, decoded where it is read.
+
+A texture of such an image takes a third of the memory of its numbers in float32. These have their place all the same, as a
+tensor that anyone may ask for, but nothing is written there, and so no memory is taken, before someone does.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchpt.images.texels import ByteImage, Texels, decoded_bytes
+
+__all__ = ["PackedImages", "PackedTexels", "decode_table"]
+
+
+def decode_table() -> Tensor:
+    """Return what bytes stand for ``(512,)`` float32: first fractions of 255, then colours decoded from sRGB."""
+    return torch.from_numpy(np.concatenate([decoded_bytes(encoded=False), decoded_bytes(encoded=True)]))
+
+
+@dataclass(frozen=True, eq=False)
+class PackedTexels:
+    """An image among the words of :class:`PackedImages`.
+
+    Attributes:
+        words: ``(T,)`` int32, the texels of all images: the first channel in the lowest byte.
+        first: number of its first texel there.
+        height: H.
+        width: W.
+        channels: C, from 1 to 4.
+        encoded: True: colours are decoded from sRGB. The last of 2 or 4 channels, alpha, is not.
+    """
+
+    words: Tensor
+    first: int
+    height: int
+    width: int
+    channels: int
+    encoded: bool
+
+    def values(self) -> NDArray[np.float32]:
+        """Return the texels ``(H, W, C)``, decoded."""
+        count = self.height * self.width
+        stored = self.words[self.first : self.first + count].numpy().view(np.uint8).reshape(self.height, self.width, 4)
+        texels = Texels(stored[..., : self.channels], eight_bit=True, white=255)
+        return texels.decoded if self.encoded else texels.values
+
+
+class PackedImages:
+    """The images of a scene that are packed, and the tensors that get their numbers once someone asks for these.
+
+    Args:
+        images: the images by name.
+        tensors: ``(H, W, C)`` float32 each, by name; not written to before :meth:`unpack`. Images without one have their
+            numbers elsewhere.
+    """
+
+    def __init__(self, images: Mapping[str, ByteImage], tensors: Mapping[str, Tensor]) -> None:
+        sizes = {name: image.shape[0] * image.shape[1] for name, image in images.items()}
+        words = torch.zeros(sum(sizes.values()), dtype=torch.int32)
+        bytes_of = words.numpy().view(np.uint8).reshape(-1, 4)
+        self._found: dict[str, PackedTexels] = {}
+        first = 0
+        for name, image in images.items():
+            height, width, channels = image.shape
+            bytes_of[first : first + sizes[name], :channels] = image.stored.reshape(-1, channels)
+            self._found[name] = PackedTexels(words, first, height, width, channels, image.encoded)
+            first += sizes[name]
+        self._tensors, self._lock = dict(tensors), threading.Lock()
+
+    def found(self) -> Mapping[str, PackedTexels]:
+        """Return the images by name; none once they are unpacked."""
+        return self._found
+
+    def unpack(self) -> bool:
+        """Write the numbers of all images to their tensors; return False if that was done before."""
+        with self._lock:
+            for name, tensor in self._tensors.items() if self._found else ():
+                # By numpy: torch would count it as a change of the tensor.
+                tensor.numpy()[...] = self._found[name].values()
+            unpacked, self._found = bool(self._found), {}
+            return unpacked
