@@ -70,7 +70,8 @@ class PackedImages:
         first = 0
         for name, image in images.items():
             height, width, channels = image.shape
-            bytes_of[first : first + sizes[name], :channels] = image.stored.reshape(-1, channels)
+            for k in range(channels):  # one by one: several times faster than texel by texel
+                bytes_of[first : first + sizes[name], k] = image.stored[..., k].reshape(-1)
             self._found[name] = PackedTexels(words, first, height, width, channels, image.encoded)
             first += sizes[name]
         self._tensors, self._lock = dict(tensors), threading.Lock()

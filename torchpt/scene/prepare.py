@@ -165,10 +165,15 @@ def make_wave(
     if like is None:
         uv = any(layer.uv for layer in surface_layers(settings).values())  # an AOV shows texture coordinates
         with one_thread() if scene.numbers <= QUICK_NUMBERS else nullcontext():
-            world, geometry = scene.world(
-                dtype, world_params, uv=uv, choice=settings.light_choice, alone=edges or settings.lights_alone
-            )
             threads = None if settings.render.threads == "auto" else int(settings.render.threads)
+            world, geometry = scene.world(
+                dtype,
+                world_params,
+                uv=uv,
+                choice=settings.light_choice,
+                alone=edges or settings.lights_alone,
+                accel=(settings.render.accel, threads),
+            )
             surfaces_move = any(
                 name.startswith("shapes.") and scene.spec(name).moves is Moves.SURFACES for name in world_params
             )

@@ -12,7 +12,8 @@ import copy
 import itertools
 import math
 import threading
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 from weakref import WeakValueDictionary
@@ -26,7 +27,7 @@ from torchpt.core.autograd import outside_transforms
 from torchpt.core.errors import SceneError, example_names
 from torchpt.core.memory import MemoryMeter, mb, retry_out_of_memory, trim_heap
 from torchpt.core.memory_block import MemoryBlock, with_own_memory
-from torchpt.core.threads import outside_inference_mode, warm_up
+from torchpt.core.threads import ReadAhead, outside_inference_mode, thread_count, warm_up
 from torchpt.core.tree import moved
 from torchpt.images import PackedImages
 from torchpt.physics.bsdfs import Bsdf
@@ -417,6 +418,7 @@ class Scene:
         uv: bool = False,
         choice: str = "auto",
         alone: bool = False,
+        accel: tuple[str, int | None] | None = None,
     ) -> tuple[World, Geometry]:
         """Return the world and the geometry for the search; cached for the scene's own parameters.
 
@@ -426,6 +428,7 @@ class Scene:
             uv: True for texture coordinates even where no texture reads them.
             choice: the light sampler, from ``lights.LIGHT_SAMPLERS``.
             alone: True where lights are sampled alone, not combined with BSDF sampling by MIS.
+            accel: arguments of :meth:`accel`, for a search structure that is built beside the scene's own world.
         """
         if params:
             return self._assemble(self.merged(params), dtype, uv=uv, choice=choice, alone=alone)
@@ -433,9 +436,20 @@ class Scene:
             self._refresh()
             key = dtype, uv, choice, alone
             if key not in self._worlds:
-                with outside_inference_mode(), torch.no_grad():
+                with outside_inference_mode(), torch.no_grad(), ReadAhead(thread_count(None)) as beside:
+                    begun: list[Callable[[], Accel]] = []
+
+                    def begin(geometry: Geometry) -> None:
+                        if accel is not None and accel not in self._accels and dtype == torch.float32:
+                            begun.append(beside.add(partial(self._build_accel, accel, geometry)))
+
                     merged = self.merged(None)
-                    self._worlds[key] = self._assemble(merged, dtype, uv=uv, choice=choice, alone=alone)
+                    self._worlds[key] = self._assemble(
+                        merged, dtype, uv=uv, choice=choice, alone=alone, on_geometry=begin
+                    )
+                    for built in begun:
+                        assert accel is not None
+                        self._accels[accel] = built()
                 trim_heap()  # of large meshes and textures, temporaries are as much as what is kept
             return self._worlds[key]
 
@@ -549,9 +563,16 @@ class Scene:
         return describe(self.description, self._built, world, self.accel(settings.render.accel, threads), settings)
 
     def _assemble(
-        self, params: Mapping[str, Tensor], dtype: torch.dtype, *, uv: bool, choice: str, alone: bool
+        self,
+        params: Mapping[str, Tensor],
+        dtype: torch.dtype,
+        *,
+        uv: bool,
+        choice: str,
+        alone: bool,
+        on_geometry: Callable[[Geometry], None] | None = None,
     ) -> tuple[World, Geometry]:
-        """Assemble the world on the host, and copy it to the device.
+        """Assemble the world on the host, and copy it to the device; ``on_geometry`` gets the host's geometry before the rest.
 
         torch's operators round differently on a GPU, and a ray that then takes another way changes the picture. Tensors that
         are a parameter as it is, such as texels, are not copied.
@@ -575,6 +596,7 @@ class Scene:
             choice=choice,
             alone=alone,
             own_models=self.own_models,
+            on_geometry=on_geometry if self.device.type == "cpu" else None,
         )
         if self.device.type == "cpu":
             return made

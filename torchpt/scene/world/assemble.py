@@ -8,7 +8,7 @@ Features that the scene does not use have no tensors: smooth normals, lights, qu
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -60,6 +60,7 @@ def assemble(
     choice: str = "auto",
     alone: bool = False,
     own_models: Sequence[Bsdf] = (),
+    on_geometry: Callable[[Geometry], None] | None = None,
 ) -> tuple[World, Geometry]:
     """Build the world that stages read, and the geometry that the search reads.
 
@@ -75,6 +76,7 @@ def assemble(
         choice: the light sampler, from ``lights.LIGHT_SAMPLERS``.
         alone: True where lights are sampled alone, not combined with BSDF sampling by MIS.
         own_models: the user's own BSDFs, whose results may depend on more than parameters.
+        on_geometry: gets the geometry before the rest is built.
 
     Raises:
         SceneError: parameters with positions or sizes beyond the range of float32.
@@ -83,7 +85,10 @@ def assemble(
     assembly = _Assembly(parts, copies, sources, reads, space, dtype, uv=uv, own_models=own_models)
     # Of environments alone the light table depends on it: elsewhere both ways share their table.
     alone = alone or not any(issubclass(LIGHTS[source.kind], Environment) for source in sources)
-    return assembly.world(choice, alone), assembly.geometry()
+    geometry = assembly.geometry()
+    if on_geometry is not None:
+        on_geometry(geometry)
+    return assembly.world(choice, alone), geometry
 
 
 class _Assembly(Pieced):
