@@ -141,12 +141,12 @@ def test_texels_in_place_of_packed_ones():
     texels = torch.full((3, 2, 3), 0.25, requires_grad=True)
     loaded, known = one(), one()
     assert known.params
-    for found in (loaded, known):
-        torchpt.render(found)
-        picture_of = torchpt.render(found, params={NAME: texels[:2].expand(2, 2, 3).repeat(3, 3, 1)[:6, :5]})
-        (grad,) = torch.autograd.grad(picture_of.sum(), texels)
-        found.result = picture_of.detach(), grad
-    assert torch.equal(loaded.result[0], known.result[0]) and torch.equal(loaded.result[1], known.result[1])
+    found = []
+    for chosen in (loaded, known):
+        torchpt.render(chosen)
+        picture_of = torchpt.render(chosen, params={NAME: texels[:2].expand(2, 2, 3).repeat(3, 3, 1)[:6, :5]})
+        found.append((picture_of.detach(), *torch.autograd.grad(picture_of.sum(), texels)))
+    assert torch.equal(found[0][0], found[1][0]) and torch.equal(found[0][1], found[1][1])
 
 
 @pytest.mark.parametrize("name", ["lights.sky.radiance", "shapes.plate0.to_world", "camera.fov"])
