@@ -177,8 +177,9 @@ class Scene:
         return self._tensors
 
     def take(self, params: Mapping[str, Tensor]) -> None:
-        """Take tensors in place of parameters as they were loaded."""
-        self._tensors.update(params)
+        """Take tensors in place of parameters, which are those of :attr:`params` from now on."""
+        known = self._tensors if self._packed.found().keys().isdisjoint(params) else self.params
+        known.update(params)
 
     @property
     def tensors(self) -> Mapping[str, Tensor]:
