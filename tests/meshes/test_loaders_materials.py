@@ -189,6 +189,7 @@ def test_mtl_factors_multiply_maps(tmp_path: Path) -> None:
 )
 def test_mtl_opacity_maps(tmp_path: Path, lines: str, opacity: dict[str, Any]) -> None:
     file = picture(tmp_path, "leaf.png")
+    (tmp_path / "leaf.png").write_bytes(png("RGBA"))
     assert mtl(tmp_path, lines)[0]["opacity"] == {"type": "image", "path": file, **opacity}
 
 
@@ -356,15 +357,16 @@ def test_gltf_textures_multiply_factors(tmp_path: Path) -> None:
     path = found["base_color"]["path"]
     assert isinstance(path, EncodedImage) and path.data == png("RGBA") and path.label.endswith("a.gltf: images 0")
     entry = {"type": "image", "path": path}
+    colour = {**entry, "colorspace": "srgb"}  # whatever its number of bits
     assert found == {
         "type": "principled",
-        "base_color": {**entry, "scale": [1, 0.5, 0.5]},
+        "base_color": {**colour, "scale": [1, 0.5, 0.5]},
         "roughness": {**entry, "scale": 0.5, "channel": "g"},
         "metallic": {**entry, "channel": "b"},
         "spec_trans": {**entry, "channel": "r"},
         "normal_map": entry,
         "normal_strength": 0.7,
-        "emission": entry,
+        "emission": colour,
         "opacity": {**entry, "scale": 0.5, "channel": "a"},
     }
     assert ignored == ()
@@ -386,6 +388,7 @@ def test_gltf_samplers_and_transforms(tmp_path: Path) -> None:
         "type": "image",
         "wrap": "clamp",
         "filter": "nearest",
+        "colorspace": "srgb",
         "uv_transform": {"scale": [2, 3], "rotate": pytest.approx(-90), "translate": [0.1, 0.2]},
     }
     assert ignored == ("baseColorTexture: wrapT (both directions wrap as wrapS)",)
@@ -417,7 +420,8 @@ def test_gltf_vertex_colours(tmp_path: Path) -> None:
 def test_gltf_files_beside_it_and_inside_it(tmp_path: Path, ending: str) -> None:
     (tmp_path / "the colours.png").write_bytes(png())
     found, _ = only(gltf(tmp_path, pbr(baseColorTexture={"index": 0}), ending, images=[{"uri": "the%20colours.png"}]))
-    assert found["base_color"] == {"type": "image", "path": str(tmp_path / "the colours.png")}
+    file = str(tmp_path / "the colours.png")
+    assert found["base_color"] == {"type": "image", "path": file, "colorspace": "srgb"}
     with pytest.raises(AssetError, match="images 0: the file 'gone.png' is missing"):
         gltf(tmp_path, pbr(baseColorTexture={"index": 0}), ending, images=[{"uri": "gone.png"}])
 

@@ -172,6 +172,35 @@ def test_copies_and_views():
         assert torch.equal(torchpt.render(made), expected)
 
 
+@pytest.mark.parametrize("transform", ["grad", "jacrev", "vmap"])
+def test_numbers_asked_for_within_transforms(transform):
+    """Those of torch.func hide the memory of tensors that are made or sliced within."""
+    loaded, known = one(), one()
+    assert known.params
+
+    def of(found):
+        def loss(factor):
+            return torchpt.render(found, params={NAME: found.params[NAME] * factor}, spp=2).mean()
+
+        return loss
+
+    at = torch.tensor([0.5, 0.25]) if transform == "vmap" else torch.tensor(0.5)
+    found = [getattr(torch.func, transform)(of(chosen))(at) for chosen in (loaded, known)]
+    assert torch.equal(*found)
+
+
+def test_another_default_device():
+    """Tensors of scenes on a CPU are made there, and traces as well."""
+    film = {"width": 9, "height": 7}
+    with torch.device("meta"):
+        loaded = one()
+        picture_of = torchpt.render(loaded, film=film)
+        assert loaded.params[NAME].device.type == "cpu"
+        copied = copy.deepcopy(loaded)
+    assert torch.equal(picture_of, torchpt.render(one(), film=film))
+    assert torch.equal(torchpt.render(copied), torchpt.render(one()))
+
+
 def test_threads_that_ask_at_once():
     """One asks for the numbers while others render."""
     expected = torchpt.render(one())

@@ -170,7 +170,7 @@ class Lanewise:
             return _input(tracer, slots - 1, _example_lanes(x, lanes))
 
         inputs = self._with_tensors_replaced(args, lane, lambda x: tracer.uniform(x.clone()))
-        with torch.no_grad(), tracer:
+        with torch.no_grad(), torch.device("cpu"), tracer:  # whatever the caller's default device
             results = self._function(*inputs)
         stores = _stores(tracer, [results] if isinstance(results, Tensor) else results)
         # Each thread calls the kernel for some of the lanes, which it numbers from 0: the number within all is not known.

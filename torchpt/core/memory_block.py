@@ -19,7 +19,7 @@ class MemoryBlock:
     """A block of memory for ``size`` numbers in float32, filled by :meth:`add` and :meth:`reserve`."""
 
     def __init__(self, size: int) -> None:
-        self._numbers, self._end = torch.empty(size, dtype=torch.float32), 0
+        self._numbers, self._end = torch.empty(size, dtype=torch.float32, device="cpu"), 0
 
     def add(self, array: NDArray[np.float32]) -> Tensor:
         """Return a tensor with the values of ``array``, after those that were added before."""
@@ -30,7 +30,9 @@ class MemoryBlock:
         start, self._end = self._end, self._end + math.prod(shape)
         view = self._numbers[start : self._end].view(shape)
         # A tensor of its own in the same memory: views share their count of changes in place.
-        return torch.empty(0, dtype=torch.float32).set_(view.untyped_storage(), start, view.shape, view.stride())
+        return torch.empty(0, dtype=torch.float32, device="cpu").set_(
+            view.untyped_storage(), start, view.shape, view.stride()
+        )
 
 
 def common_block(tensors: Sequence[Tensor]) -> Tensor | None:

@@ -10,7 +10,7 @@ import re
 import tempfile
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
@@ -167,6 +167,18 @@ def _check_size(
         raise AssetError(label, f"cannot be read ({width} x {height} pixels declared in {file_bytes} bytes)")
 
 
+#: Pixels as they are to be seen from those of a file, by its orientation (TIFF 6.0).
+_UPRIGHT: dict[int, Callable[[NDArray[Any]], NDArray[Any]]] = {
+    2: np.fliplr,
+    3: lambda x: np.rot90(x, 2),
+    4: np.flipud,
+    5: lambda x: x.swapaxes(0, 1),
+    6: lambda x: np.rot90(x, -1),
+    7: lambda x: np.rot90(x.swapaxes(0, 1), 2),
+    8: lambda x: np.rot90(x, 1),
+}
+
+
 def _decode_by_oiio(source: Path | EncodedImage, label: str, ending: str, stored: str, max_pixels: int) -> Pixels:
     """Decode all channels of the first part of a file with OpenImageIO, as ``stored`` values: ``uint16`` or ``float``."""
     if isinstance(source, EncodedImage):  # OpenImageIO reads files only
@@ -175,6 +187,12 @@ def _decode_by_oiio(source: Path | EncodedImage, label: str, ending: str, stored
             file.flush()
             return _decode_by_oiio(Path(file.name), label, ending, stored, max_pixels)
     import OpenImageIO as oiio
+
+    def upright(values: NDArray[Any]) -> NDArray[Any]:
+        """Return pixels as they are to be seen: Radiance files may have them in any order."""
+        return (
+            _UPRIGHT.get(spec.get_int_attribute("Orientation", 1), lambda x: x)(values) if ending == ".hdr" else values
+        )
 
     options = oiio.ImageSpec()
     options.attribute("oiio:UnassociatedAlpha", 1)  # a PNG's colours as stored, not multiplied by alpha
@@ -193,7 +211,7 @@ def _decode_by_oiio(source: Path | EncodedImage, label: str, ending: str, stored
             if values is None:
                 raise AssetError(label, f"cannot be read ({oiio_error(picture) or 'truncated'})")
             values = values.reshape(spec.height, spec.width, spec.nchannels)
-            return Pixels(values, white=_WHITE_OF_16_BITS, channels=tuple(spec.channelnames))
+            return Pixels(upright(values), white=_WHITE_OF_16_BITS, channels=tuple(spec.channelnames))
         step = max(1, _VALUES_PER_BAND // (spec.width * spec.nchannels))
         for start in range(0, spec.height, step):
             end = min(start + step, spec.height)
@@ -204,7 +222,7 @@ def _decode_by_oiio(source: Path | EncodedImage, label: str, ending: str, stored
                 values = np.empty((spec.height, spec.width, spec.nchannels), band.dtype)
             values[start:end] = band.reshape(end - start, spec.width, spec.nchannels)
         assert values is not None
-        return Pixels(values, white=_WHITE_OF_16_BITS, channels=tuple(spec.channelnames))
+        return Pixels(upright(values), white=_WHITE_OF_16_BITS, channels=tuple(spec.channelnames))
     finally:
         picture.close()
 
@@ -262,15 +280,32 @@ def _pillow_pixels(picture: Any, label: str, size: int, max_pixels: int) -> Pixe
     _check_size(label, width, height, len(picture.getbands()), max_pixels, size)
     if picture.mode not in _MODES:
         raise AssetError(label, f"colours stored as {picture.mode} are not read; expected grey or RGB")
-    if "transparency" in picture.info and picture.mode in ("1", "L", "P", "RGB"):
+    if "transparency" in picture.info and picture.mode in _GREYS:
+        return _with_transparent_grey(picture)
+    if "transparency" in picture.info and picture.mode in ("P", "RGB"):
         picture.load()
-        grey = picture.mode in ("1", "L")
-        picture = (picture.convert("L") if grey else picture).convert("LA" if grey else "RGBA")
+        picture = picture.convert("RGBA")
     elif picture.mode == "P":
         picture.load()
         picture = picture.convert(picture.palette.mode if picture.palette.mode in ("RGB", "RGBA") else "RGB")
     values = np.array(picture)
     return Pixels(values[..., None] if values.ndim == 2 else values, white=_MODES[picture.mode])
+
+
+#: Pillow's modes of grey PNG files.
+_GREYS = ("1", "L", "I;16", "I;16B", "I;16L", "I")
+
+
+def _with_transparent_grey(picture: Any) -> Pixels:
+    """Return grey pixels of a PNG with an alpha channel, 0 where they have its transparent value, and else 1."""
+    transparent, white = picture.info["transparency"], _MODES[picture.mode]
+    # Pillow scales pixels of 2 and 4 bits to 8, but not this value. It forgets the number of bits when it loads them.
+    transparent *= {"L;2": 85, "L;4": 17}.get(picture.tile[0].args, 1)
+    values = np.array(picture)
+    if picture.mode == "1":
+        values, white, transparent = values.astype(np.uint8), 1, int(bool(transparent))
+    alpha = np.where(values == transparent, 0, white).astype(values.dtype)
+    return Pixels(np.stack((values, alpha), -1), white=white)
 
 
 # Pillow's modes that are supported, with the value that stands for 1

@@ -12,6 +12,10 @@ __all__ = ["channel_names", "group_channels"]
 
 #: Names of components by their number.
 _SUFFIXES = {2: "XY", 3: "RGB", 4: "RGBA"}
+#: What some programs call the channels of the picture itself, in any case.
+_SPELLINGS = (("r", "g", "b", "a"), ("red", "green", "blue", "alpha"))
+#: Names of the channels of the picture itself.
+_PICTURE = ("R", "G", "B", "A", "Y")
 #: Order of the components of a layer.
 _ORDER = "RGBXYZUVA"
 
@@ -31,6 +35,16 @@ def channel_names(layer: str, components: int) -> tuple[str, ...]:
     return tuple(f"{layer}.{s}" for s in suffixes)
 
 
+def _usual(channels: tuple[str, ...] | list[str]) -> list[str]:
+    """Return names of channels, those of the picture itself as they usually are where a program spells them in another way."""
+    if not any(name in _PICTURE for name in channels):
+        for spelling in _SPELLINGS:
+            if set(spelling[:3]) <= {name.lower() for name in channels}:
+                usual = dict(zip(spelling, "RGBA", strict=True))
+                return [usual.get(name.lower(), name) for name in channels]
+    return list(channels)
+
+
 def _component_order(channel: str) -> tuple[int, int, str]:
     """Return the sort key of a channel among the components of its layer: numbers first, then letters by _ORDER."""
     _, _, last = channel.rpartition(".")
@@ -41,12 +55,13 @@ def _component_order(channel: str) -> tuple[int, int, str]:
 
 def group_channels(channels: tuple[str, ...] | list[str]) -> dict[str, list[int]]:
     """Return the channel indices of each layer, components in order: the inverse of `channel_names`."""
+    channels = _usual(channels)
     groups: dict[str, list[int]] = {}
     for index, channel in enumerate(channels):
         prefix, _, last = channel.rpartition(".")
         if not prefix and last == "Z":  # the usual name of depth
             prefix = "depth"
         elif not prefix:
-            prefix = "image" if last in ("R", "G", "B", "A", "Y") else last
+            prefix = "image" if last in _PICTURE else last
         groups.setdefault(prefix, []).append(index)
     return {name: sorted(indices, key=lambda i: _component_order(channels[i])) for name, indices in groups.items()}

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchpt.images.texels import ByteImage, Texels, decoded_bytes
+from torchpt.images.texels import ByteImage, decoded_bytes
 
 __all__ = ["PackedImages", "PackedTexels", "decode_table"]
 
@@ -36,6 +36,7 @@ class PackedTexels:
         width: W.
         channels: C, from 1 to 4.
         encoded: True: colours are decoded from sRGB. The last of 2 or 4 channels, alpha, is not.
+        stored: ``(H, W, C)`` uint8, the same memory.
     """
 
     words: Tensor
@@ -44,13 +45,11 @@ class PackedTexels:
     width: int
     channels: int
     encoded: bool
+    stored: NDArray[np.uint8]
 
     def values(self) -> NDArray[np.float32]:
         """Return the texels ``(H, W, C)``, decoded."""
-        count = self.height * self.width
-        stored = self.words[self.first : self.first + count].numpy().view(np.uint8).reshape(self.height, self.width, 4)
-        texels = Texels(stored[..., : self.channels], eight_bit=True, white=255)
-        return texels.decoded if self.encoded else texels.values
+        return ByteImage(self.stored, self.encoded).values()
 
 
 class PackedImages:
@@ -60,21 +59,27 @@ class PackedImages:
         images: the images by name.
         tensors: ``(H, W, C)`` float32 each, by name; not written to before :meth:`unpack`. Images without one have their
             numbers elsewhere.
+
+    Attributes:
+        pending: True until images are unpacked.
     """
 
     def __init__(self, images: Mapping[str, ByteImage], tensors: Mapping[str, Tensor]) -> None:
         sizes = {name: image.shape[0] * image.shape[1] for name, image in images.items()}
-        words = torch.zeros(sum(sizes.values()), dtype=torch.int32)
-        bytes_of = words.numpy().view(np.uint8).reshape(-1, 4)
+        # By numpy: tensors that are made within a transform of torch.func, or under another default device, have no memory.
+        numbers = np.zeros(sum(sizes.values()), np.int32)
+        words, bytes_of = torch.from_numpy(numbers), numbers.view(np.uint8).reshape(-1, 4)
         self._found: dict[str, PackedTexels] = {}
         first = 0
         for name, image in images.items():
             height, width, channels = image.shape
             for k in range(channels):  # one by one: several times faster than texel by texel
                 bytes_of[first : first + sizes[name], k] = image.stored[..., k].reshape(-1)
-            self._found[name] = PackedTexels(words, first, height, width, channels, image.encoded)
+            stored = bytes_of[first : first + sizes[name], :channels].reshape(height, width, channels)
+            self._found[name] = PackedTexels(words, first, height, width, channels, image.encoded, stored)
             first += sizes[name]
-        self._tensors, self._lock = dict(tensors), threading.Lock()
+        self._arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
+        self._lock, self.pending = threading.Lock(), bool(images)
 
     def found(self) -> Mapping[str, PackedTexels]:
         """Return the images by name; none once they are unpacked."""
@@ -83,8 +88,7 @@ class PackedImages:
     def unpack(self) -> bool:
         """Write the numbers of all images to their tensors; return False if that was done before."""
         with self._lock:
-            for name, tensor in self._tensors.items() if self._found else ():
-                # By numpy: torch would count it as a change of the tensor.
-                tensor.numpy()[...] = self._found[name].values()
-            unpacked, self._found = bool(self._found), {}
+            for name, array in self._arrays.items() if self._found else ():
+                array[...] = self._found[name].values()  # which torch does not count as a change of the tensor
+            unpacked, self._found, self.pending = bool(self._found), {}, False
             return unpacked

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from os import PathLike
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchpt.core.autograd import outside_transforms
 from torchpt.core.errors import AssetError
 from torchpt.core.files import read_regular
 from torchpt.images.colour import srgb_to_linear
@@ -101,10 +102,14 @@ class Texels:
         return {}
 
 
+@cache
 def decoded_bytes(encoded: bool, white: int = 255) -> NDArray[np.float32]:
     """Return what the whole numbers ``0 .. white`` stand for ``(white + 1,)``; ``encoded``: they are sRGB."""
     numbers = np.arange(white + 1, dtype=np.float32) / np.float32(white)
-    return srgb_to_linear(torch.from_numpy(numbers)).numpy() if encoded else numbers
+    if not encoded:
+        return numbers
+    with outside_transforms():
+        return srgb_to_linear(torch.from_numpy(numbers)).numpy()
 
 
 @dataclass(eq=False)
@@ -236,13 +241,17 @@ def check_source(values: Mapping[str, Any]) -> None:
 
 
 def has_alpha(source: str | PathLike[str] | EncodedImage) -> bool:
-    """Return True for a PNG with an alpha channel or a transparent colour; False for any other file."""
+    """Return True for a PNG with an alpha channel or a transparent colour, and for a TGA with one; False for any other file."""
     try:
         data = source.data if isinstance(source, EncodedImage) else read_regular(source)
     except OSError:
         return False
     if not data.startswith(b"\x89PNG\r\n\x1a\n"):
-        return False
+        name = f".{source.kind}" if isinstance(source, EncodedImage) else str(source)
+        # Bytes 2 and 16 of a TGA: the kind, here grey, and bits a pixel.
+        return name.lower().endswith(".tga") and data[16:17] == (
+            b"\x10" if data[2:3] in (b"\x03", b"\x0b") else b"\x20"
+        )
     if data[25:26] in (b"\x04", b"\x06"):  # the colour type: grey with alpha, or RGB with alpha
         return True
     # A transparent colour is a chunk tRNS before the pixels (IDAT). A chunk is size, name, data and checksum.
@@ -257,7 +266,9 @@ def select_picture(pixels: Pixels) -> NDArray:
     if not pixels.channels or pixels.values.dtype.kind != "f":
         return pixels.values
     groups = group_channels(pixels.channels)
-    channels = groups.get("image", next(iter(groups.values())))
+    channels = groups.get("image", [])
+    if not channels or (len(groups) > 1 and [pixels.channels[index] for index in channels] == ["A"]):
+        channels = next(indices for name, indices in groups.items() if name != "image")  # alpha alone is no picture
     if channels == list(range(pixels.values.shape[-1])):
         return pixels.values
     return pixels.values[..., channels]

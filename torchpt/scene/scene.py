@@ -172,9 +172,15 @@ class Scene:
         next render, which checks them like a scene file; to differentiate, pass replacements to ``torchpt.render(scene,
         params=...)``. Images of 8 bits a value are decoded when this is first asked for.
         """
+        if self._packed.pending:
+            # torch.compile leaves it to Python.
+            unpack: Any = torch.compiler.disable(self._unpack) if torch.compiler.is_compiling() else self._unpack
+            unpack()
+        return self._tensors
+
+    def _unpack(self) -> None:
         if self._packed.unpack():
             self._pieces.clear()  # those of packed images
-        return self._tensors
 
     def take(self, params: Mapping[str, Tensor]) -> None:
         """Take tensors in place of parameters, which are those of :attr:`params` from now on."""

@@ -269,7 +269,7 @@ def trace_stage(leaves: NamedTensors, layout: Layout, build: Callable[[Trace], S
     # A number of lanes that divides no axis of a leaf: axes of lanes are told apart from those of tables by their length.
     tracer = Tracer(choose_lane_count(leaves.tensors.values()), leaves.ids)
     trace = Trace(tracer, layout)
-    with torch.no_grad():
+    with torch.no_grad(), torch.device("cpu"):  # whatever the caller's default device
         sinks = build(trace)
     tables, steps, guards = without_unused_steps(tracer.tables, tracer.steps, tracer.guards)
     searches = any(op in ("nearest", "occluded") for op, *_ in tracer.graph.nodes)

@@ -27,6 +27,7 @@ def image_texture(
     wrap: str = "repeat",
     nearest: bool = False,
     uv_transform: dict[str, Any] | None = None,
+    encoded: bool = False,
 ) -> dict[str, Any]:
     """Return the block ``{type: image, path: ..., ...}``.
 
@@ -37,6 +38,7 @@ def image_texture(
         wrap: ``repeat``, ``clamp`` or ``mirror``.
         nearest: True where texels are not interpolated.
         uv_transform: the block of a scene file; empty for none.
+        encoded: True: colours are sRGB, of whatever number of bits.
     """
     entry: dict[str, Any] = {"type": "image", "path": path}
     if wrap != "repeat":
@@ -47,6 +49,8 @@ def image_texture(
         entry["scale"] = scale
     if channel is not None:
         entry["channel"] = channel
+    if encoded:
+        entry["colorspace"] = "srgb"
     if uv_transform:
         entry["uv_transform"] = uv_transform
     return entry

@@ -91,6 +91,8 @@ class _Scene:
                 part = self.primitive(mesh, node, number, primitive, materials, left_out)
                 if part is not None:
                     parts.append(transformed(part, matrix))
+        # Names of what the whole file lacks, known once all of it is read.
+        parts = [replace(part, ignored=tuple(dict.fromkeys((*left_out, *part.ignored)))) for part in parts]
         # `checked` drops parts without faces, so lights and cameras go with the first other one.
         holder = next((number for number, part in enumerate(parts) if len(part.faces)), None)
         if holder is not None:
@@ -176,7 +178,8 @@ class _Scene:
         vertices = read(attributes["POSITION"], "VEC3")
         normals = read(attributes["NORMAL"], "VEC3") if "NORMAL" in attributes else None
         uvs = read(attributes["TEXCOORD_0"], "VEC2") if "TEXCOORD_0" in attributes else None
-        colors = read(attributes["COLOR_0"], "VEC3", "VEC4")[:, :3] if "COLOR_0" in attributes else None
+        rgba = read(attributes["COLOR_0"], "VEC3", "VEC4").clip(0.0, 1.0) if "COLOR_0" in attributes else None
+        colors = None if rgba is None else rgba[:, :3]
         for name, value in (("NORMAL", normals), ("TEXCOORD_0", uvs), ("COLOR_0", colors)):
             if value is not None and len(value) != len(vertices):
                 raise AssetError(self.path, f"{name} has {len(value)} rows for {len(vertices)} vertices")
@@ -186,8 +189,7 @@ class _Scene:
             index = np.arange(len(vertices))
         label = str(mesh.get("name") or node.get("name") or "")[:80]
         label = label if len(mesh["primitives"]) == 1 else f"{label}{number}"
-        ignored = list(left_out)
-        ignored += [str(name) for name in attributes if name not in (*_ATTRIBUTES, "TANGENT", "JOINTS_0", "WEIGHTS_0")]
+        ignored = [str(name) for name in attributes if name not in (*_ATTRIBUTES, "TANGENT", "JOINTS_0", "WEIGHTS_0")]
         ignored += [str(name) for name in primitive.get("extensions", {})]
         if primitive.get("targets"):
             ignored.append("morph targets")
@@ -196,6 +198,12 @@ class _Scene:
         material: FileMaterial | None = None
         if materials:
             material, colors = self.materials.convert(primitive.get("material"), colors)
+            block = self.json.get("materials", [])[primitive["material"]] if "material" in primitive else {}
+            translucent = block.get("alphaMode", "OPAQUE") != "OPAQUE"
+            if translucent and rgba is not None and rgba.shape[1] == 4 and (rgba[:, 3] < 1.0).any():
+                ignored.append("COLOR_0 (its alpha)")
+            if "normalTexture" in block and uvs is not None and _any_mirrored(uvs, _triangles(index, mode, self.path)):
+                ignored.append("normalTexture (its green channel where texture coordinates are mirrored)")
         faces = _triangles(index, mode, self.path)
         return MeshPart(
             name=label,
@@ -206,7 +214,16 @@ class _Scene:
             colors=colors,
             material=material,
             ignored=tuple(dict.fromkeys(ignored)),
+            flat=normals is None,  # as the format wants it
         )
+
+
+def _any_mirrored(uvs: NDArray[np.float64], faces: NDArray[np.int64]) -> bool:
+    """Return True where texture coordinates ``(V, 2)``, whose v goes down, go round a face ``(F, 3)`` against its corners."""
+    inside = faces[((faces >= 0) & (faces < len(uvs))).all(1)]
+    a, b, c = (uvs[inside[:, k]] for k in range(3))
+    (x, y), (u, v) = (b - a).T, (c - a).T
+    return bool((x * v - y * u > 0).any())
 
 
 def _triangles(index: NDArray[np.int64], mode: int, path: Path) -> NDArray[np.int64]:

@@ -321,8 +321,6 @@ class Document:
             values = self._rows(
                 accessor["bufferView"], offset=offset, count=count, component=component, width=width, where=where
             ).astype(np.float64)
-        elif sparse is None:
-            raise AssetError(self.path, f"{where} has no data (no bufferView)")
         elif count > _MOST_ZEROS:
             raise AssetError(self.path, f"{where} declares {count} rows without data (at most {_MOST_ZEROS} are read)")
         else:

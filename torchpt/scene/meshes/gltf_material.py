@@ -114,7 +114,7 @@ class _Converter(NumberReader):
         pbr = self.block.get("pbrMetallicRoughness", {})
         factor = self.numbers(pbr, "baseColorFactor", (1.0, 1.0, 1.0, 1.0))
         self.base_color = (factor[0], factor[1], factor[2])
-        texture = self.texture(pbr, "baseColorTexture", number_if_grey(self.base_color), channel=None)
+        texture = self.texture(pbr, "baseColorTexture", number_if_grey(self.base_color), channel=None, encoded=True)
         if has_colors and texture is not None:
             self.ignored.append("COLOR_0 (beside baseColorTexture)")
         elif has_colors:
@@ -195,8 +195,11 @@ class _Converter(NumberReader):
         if alpha is None or not has_alpha(alpha["path"]):
             alpha = factor
         if mode == "MASK":
-            material["opacity"] = alpha
-            material["alpha_cutoff"] = min(self.number(self.block, "alphaCutoff", 0.5, high=math.inf), 1.0)
+            cutoff = self.number(self.block, "alphaCutoff", 0.5, high=math.inf)
+            if cutoff > 1.0:  # above any alpha
+                material["opacity"] = 0.0
+            else:
+                material["opacity"], material["alpha_cutoff"] = alpha, cutoff
         elif alpha != 1.0:
             material["opacity"] = alpha
 
@@ -220,11 +223,13 @@ class _Converter(NumberReader):
         if max(color) * strength == 0:
             return
         picture = self.texture(
-            self.block, "emissiveTexture", number_if_grey((color[0], color[1], color[2])), channel=None
+            self.block, "emissiveTexture", number_if_grey((color[0], color[1], color[2])), channel=None, encoded=True
         )
         material["emission"] = list(color) if picture is None else picture
         if strength != 1.0:
             material["emission_strength"] = strength
+        if self.block.get("doubleSided"):
+            self.ignored.append("doubleSided (light leaves the front alone)")
 
     def extension(self, name: str, read: tuple[str, ...]) -> dict[str, Any]:
         """Return the block of ``KHR_materials_NAME``; keys other than ``read`` are listed as ignored."""
@@ -238,7 +243,15 @@ class _Converter(NumberReader):
         found = self.texture(block, key, factor, channel=channel) if factor != 0 else None
         return factor if found is None else found
 
-    def texture(self, block: dict[str, Any], key: str, scale: float | list[float], *, channel: str | None) -> Any:
+    def texture(
+        self,
+        block: dict[str, Any],
+        key: str,
+        scale: float | list[float],
+        *,
+        channel: str | None,
+        encoded: bool = False,
+    ) -> Any:
         """Return the texture that a textureInfo of the file refers to; None where it is missing or unsupported.
 
         Args:
@@ -246,6 +259,7 @@ class _Converter(NumberReader):
             key: key of the textureInfo.
             scale: factor of the values.
             channel: channel that a number is read from; None for a colour.
+            encoded: True for colours, which are sRGB of whatever number of bits.
         """
         info = block.get(key)
         if info is None:
@@ -286,4 +300,5 @@ class _Converter(NumberReader):
             wrap=wrap_u,
             nearest=sampler.get("magFilter") == _NEAREST,
             uv_transform=transform,
+            encoded=encoded,
         )

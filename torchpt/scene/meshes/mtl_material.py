@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import PurePath
 from typing import Any
 
+from torchpt.images import has_alpha
 from torchpt.scene.meshes.file_texture import image_texture, number_if_grey
 
 __all__ = ["COLORS", "MAPS", "NUMBERS", "Map", "Statements", "coat_gloss", "material_of"]
@@ -233,9 +234,9 @@ class _Converter:
         found = self.maps.get("map_d")
         if found is not None:
             channel = found.channel
-            # The image of the colour again: its alpha is meant, which JPEG files do not have.
-            if channel is None and self.files["map_d"] == self.files.get("map_kd"):
-                channel = "a" if PurePath(self.files["map_d"]).suffix.lower() not in (".jpg", ".jpeg") else None
+            # The image of the colour again: its alpha is meant, where it has one.
+            if channel is None and self.files["map_d"] == self.files.get("map_kd") and has_alpha(self.files["map_d"]):
+                channel = "a"
             opacity = self.opacity if self.opacity > 0 else 1.0  # beside a map exporters write 0 for absent
             material["opacity"] = self._image("map_d", opacity, channel=channel or "luminance")
         elif self.opacity != 1.0:

@@ -80,11 +80,7 @@ def load_obj(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
     order = np.argsort(group_of_triangle, kind="stable")  # faces of a group stay in the order of the file
     ends = np.searchsorted(group_of_triangle[order], np.arange(1, len(text.groups) + 1))
     for (name, _), rows in zip(text.groups.items(), np.split(order, ends[:-1]), strict=True):
-        faces = all_faces[rows]
-        is_used = np.zeros(len(corners), bool)
-        is_used[faces] = True
-        used = np.flatnonzero(is_used)  # vertices of the part
-        row_in_part = np.cumsum(is_used) - 1
+        used, faces = _own_rows(all_faces[rows], len(corners))
         material = known.get(name)
         if material is None and name and materials:
             material = FileMaterial(name, ignored=("not defined in an MTL file",))
@@ -94,7 +90,7 @@ def load_obj(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
             MeshPart(
                 name=name,
                 vertices=all_positions[used],
-                faces=row_in_part[faces],
+                faces=faces,
                 normals=part_normals,
                 uvs=part_uvs,
                 material=material,
@@ -102,6 +98,16 @@ def load_obj(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
             )
         )
     return parts
+
+
+def _own_rows(faces: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return which of ``count`` vertices some faces ``(F, 3)`` have, in order, and the faces in terms of these."""
+    if 8 * faces.size < count:  # few of them: a file may have many groups
+        used, inverse = np.unique(faces, return_inverse=True)
+        return used, inverse.reshape(faces.shape)
+    is_used = np.zeros(count, bool)
+    is_used[faces] = True
+    return np.flatnonzero(is_used), (np.cumsum(is_used) - 1)[faces]
 
 
 def _by_lines(data: bytes, path: Path) -> Statements:

@@ -166,7 +166,9 @@ def _part(path: Path, vertex: Columns, face: Columns, elements: list[_Element], 
     assert vertices is not None
     uvs = next((pair for pair in map(stack, _UVS) if pair is not None), None)
     ignored = [name for name in face if name in ("texcoord", "texnumber")]
-    ignored += [name for name in ("alpha",) if name in vertex]
+    ignored += [name for name in ("alpha", "diffuse_red") if name in vertex]
+    if any(set(names) <= face.keys() for names in _COLORS):
+        ignored.append("colours of faces")
     key = next((name for name in _INDICES if isinstance(face.get(name), tuple)), None)
     if key is None:
         if any(element.name == "face" and element.size for element in elements):
@@ -183,6 +185,8 @@ def _part(path: Path, vertex: Columns, face: Columns, elements: list[_Element], 
         None,
     )
     own = COLORED if materials and colors is not None else None
+    if own is not None and colors is not None and len(colors) and colors.max() > 1.0:
+        raise AssetError(path, f"holds a colour above 1: {colors.max():g}; colours of floats are linear, from 0 to 1")
     starts = np.cumsum(counts) - counts
     faces = items.astype(np.int64)[polygon_fans(starts, counts)] if len(counts) else np.zeros((0, 3), np.int64)
     return MeshPart(

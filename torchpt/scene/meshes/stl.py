@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -27,8 +28,9 @@ def load_stl(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
     del materials  # the format has none
     declared = int.from_bytes(data[80:84], "little") if len(data) >= _HEADER else -1
     size = _HEADER + _RECORD.itemsize * declared  # bytes of a binary file of so many triangles
-    # Some binary files begin with "solid" too, but have the size that their header declares.
-    if data.lstrip()[:5].lower() == b"solid" and len(data) != size:
+    # Some binary files begin with "solid" too, but have all bytes that their header declares; text in its place declares
+    # gigabytes.
+    if data.lstrip()[:5].lower() == b"solid" and not 0 <= declared <= (len(data) - _HEADER) // _RECORD.itemsize:
         corners = _ascii(path, data)
     elif declared < 0:
         raise AssetError(path, f"truncated: {len(data)} bytes, an STL file has at least {_HEADER}")
@@ -45,7 +47,9 @@ def load_stl(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
 
 def _ascii(path: Path, data: bytes) -> NDArray[np.float64]:
     """Return the corners ``(3 F, 3)`` of an ASCII file."""
-    words = data.split()
+    # The rest of these lines is a name, of any words; a file on one line has none.
+    unnamed = re.sub(rb"(?im)^([ \t]*(?:end)?solid\b)[^\r\n]*", rb"\1", data)
+    words = (unnamed if b"vertex" in unnamed.lower() else data).split()
     keys = [word.lower() for word in words]  # writers differ in case
     if b"endsolid" not in keys:
         raise AssetError(path, "truncated: no endsolid")
