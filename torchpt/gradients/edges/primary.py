@@ -24,7 +24,7 @@ from torchpt.gradients.edges.curves import (
     seams_of,
 )
 from torchpt.gradients.edges.cuts import Crossing, Cuts, crossing_of
-from torchpt.gradients.edges.film import Worth, film_places, slopes
+from torchpt.gradients.edges.film import Worth, flat_places
 from torchpt.gradients.edges.meshes import marked_primitives
 from torchpt.gradients.edges.occluders import EdgePoints, Occluders, occluders_of
 from torchpt.gradients.edges.traced import Passing, Traced, Use
@@ -89,7 +89,7 @@ def steps_at(bodies: Bodies, faces: tuple[Tensor, Tensor], s: Tensor, lens: Tens
 
 def outline_of(bodies: Bodies, prim: Tensor, lens: Tensor | None) -> list[tuple[Tensor, Tensor]]:
     """Return the sides of parallelograms ``(N,)`` on the film, from and to ``(2, N)``; a triangle's last has no length."""
-    places = [film_places(bodies.camera, corner, lens) for corner in bodies.corners(prim)]
+    places = [bodies.film.places(corner, lens) for corner in bodies.corners(prim)]
     return list(zip(places, [*places[1:], places[0]], strict=True))
 
 
@@ -244,9 +244,7 @@ def _lines(bodies: Bodies, curves: Curves, importance: Tensor, bounds: Bounds) -
     ends = []
     for t in (low, high):
         _, p, _ = curves.moving(bodies, t)
-        seen = bodies.camera.film_of(p)
-        assert seen is not None
-        ends.append(seen)
+        ends.append(bodies.film.of(p, None))
     begin, end = ends
     x0, x1, y0, y1 = bounds
 
@@ -281,15 +279,13 @@ def _arcs(bodies: Bodies, curves: Curves, importance: Tensor, bounds: Bounds) ->
     step = (whole.high - whole.low) / _CUTS
     low = whole.low + torch.arange(_CUTS, dtype=torch.float64, device=some.device).repeat(len(some)) * step
     cut = whole.within(low, low + step)
-    ends = [bodies.camera.film_of(cut.moving(bodies, t)[1]) for t in (cut.low, cut.high)]
-    first, last = ends
-    assert first is not None and last is not None
+    first, last = (bodies.film.of(cut.moving(bodies, t)[1], None) for t in (cut.low, cut.high))
     x0, x1, y0, y1 = bounds
     across = math.hypot(x1 - x0, y1 - y0)
     front = (torch.minimum(first[2], last[2]) > 0) & (torch.minimum(first[3], last[3]) > 0)
     behind = (torch.maximum(first[2], last[2]) <= 0) | (torch.maximum(first[3], last[3]) <= 0)
     length = torch.where(front, _apart(first, last), across)
-    a, b = (film_places(bodies.camera, cut.moving(bodies, t)[1], None) for t in (cut.low, cut.high))
+    a, b = flat_places(first), flat_places(last)
     near = torch.minimum(a, b) - length, torch.maximum(a, b) + length  # no arc leaves its chord by more than that
     outside = (near[0][0] > x1) | (near[1][0] < x0) | (near[0][1] > y1) | (near[1][1] < y0)
     weight = torch.where(behind | (front & outside), 0.0, length.clamp_max(across)) * take(importance, many)
@@ -336,13 +332,13 @@ class Along:
         """Return a number, differentiable in ``bodies``; of no meaning but for its derivative."""
         p = bodies.points(self.held)
         p = p if self.crossing is None else self.crossing.moved(bodies, p)
-        total = (film_places(bodies.camera, p, self.lens) * self.weight).sum()
+        total = (bodies.film.places(p, self.lens) * self.weight).sum()
         if self.beside is None:
             return total
         origin, away, weight = self.beside
         # What is infinitely far moves along with the camera.
         at = torch.where(torch.isfinite(origin), origin, bodies.camera.origin()) + away
-        return total - (film_places(bodies.camera, at, None) * weight).sum()  # no camera with a lens holds anything
+        return total - (bodies.film.places(at, None) * weight).sum()  # no camera with a lens holds anything
 
 
 @dataclass(frozen=True)
@@ -393,8 +389,7 @@ class SeenThroughLens:
         camera = self.occluders.bodies.camera
         o, _ = camera.rays(torch.zeros_like(u), torch.zeros_like(u), lens)
         drawn = self.occluders.points(self.choice, u, coin, View(o, torch.ones_like(u)))
-        seen = camera.film_of(drawn.p, rows(lens, drawn.lane))
-        assert seen is not None
+        seen = self.occluders.bodies.film.of(drawn.p, rows(lens, drawn.lane))
         return rows(drawn, (seen[2] > 0).nonzero().squeeze(1))
 
 
@@ -424,7 +419,7 @@ class Primary:
         lens = self.traced.lens(key)
         place = self.source.draw(u, coin, lens)
         lens = rows(lens, place.lane)
-        s, jacobian = slopes(self.bodies.camera, place.p, lens)
+        s, jacobian = self.bodies.film.slopes(place.p, lens)
         slope = (jacobian * place.along).sum(1)
         normal = torch.stack((slope[1], -slope[0]))  # as long as `s` changes with the curve's parameter
         length, value = (normal * normal).sum(0).sqrt(), worth.at(s)
@@ -466,7 +461,7 @@ class Primary:
         """Return rays through the film a step beside places, before their curves' normals and behind: ``(3, 2 N)``."""
         places = torch.cat((s - unit * step, s + unit * step), 1)
         lens = None if lens is None else lens.repeat(1, 2)
-        o, d = self.bodies.camera.rays(places[0], places[1], lens)
+        o, d = self.bodies.film.rays(places, lens)
         return o.expand_as(d), d
 
     def _share(
@@ -490,7 +485,7 @@ class Primary:
         A step beside an edge tells this too late: behind its outline a round surface comes forward by the root of the step, so
         that a ray beside an outline below a floor meets what stands out of the floor.
         """
-        o, d = self.bodies.camera.rays(s[0], s[1], lens)
+        o, d = self.bodies.film.rays(s, lens)
         o = o.expand_as(d)
         reach = ((place.p - o) * d).sum(0)
         t, prim = self.traced.nearest(o, d, _ending_at(reach, _NEAR, key))

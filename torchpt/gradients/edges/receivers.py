@@ -23,11 +23,12 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
+from torchpt.gradients.edges.asked import Asked
 from torchpt.gradients.edges.bodies import Bodies, Held
-from torchpt.gradients.edges.film import Worth, film_places, slopes
+from torchpt.gradients.edges.film import Worth, flat_places
 from torchpt.gradients.edges.traced import Passing, Traced
 from torchpt.gradients.edges.vertices import Spot, met
-from torchpt.math.vectors import cross, dot, largest, rows, take
+from torchpt.math.vectors import dot, largest, rows, take
 from torchpt.paths.roulette import russian_roulette, survival_probability
 from torchpt.physics.shapes.interaction import slide_share
 
@@ -78,9 +79,10 @@ class MovingFrame:
 
     def rounding(self, prim: Tensor, *points: Tensor) -> Tensor:
         """Return the rounding of points ``(3, N)`` of primitives that the search finds ``(N,)``."""
-        p0, *axes = self.bodies.place(prim)
-        size = p0.abs() + sum((axis.abs() for axis in axes), torch.zeros_like(p0))
-        return torch.stack([largest(p.abs()) for p in (size, *points)]).amax(0) * _ROUNDING
+        size = largest(self.bodies.sizes(prim))
+        for p in points:
+            size = torch.maximum(size, largest(p.abs()))
+        return size * _ROUNDING
 
     def lift(self, prim: Tensor, n: Tensor) -> Tensor:
         """Return how far off primitives ``(N,)`` rays begin along their normals ``n (3, N)``; little if these are axes."""
@@ -161,21 +163,32 @@ class Prefix:
             how = (1.0 - share) * self.frame.moving(vertex.held.prim) + share * how
         return how
 
-    def receivers(self, bodies: Bodies) -> Tensor:
-        """Return where the receivers are in the interior's frame ``(3, M)``, differentiable in ``bodies``."""
+    def ask(self, asked: Asked, cotangent: Tensor) -> None:
+        """Add to ``asked`` what a cotangent of the receivers in the interior's frame ``(3, M)`` asks of all that moves them."""
+        some = self.moves().nonzero().squeeze(1)
+        if len(some) < len(self.lane):
+            if len(some):
+                self.taken(some).ask(asked, take(cotangent, some))
+            return
         first, *others = self.vertices
-        x = bodies.points(first.held)
-        if not self.frame.holds_first:
-            o, d = bodies.camera.rays(self.place[0], self.place[1], self.lens)
-            x = o + d * (dot(first.n, x - o) / dot(first.n, d))
-        before = first.p
-        for vertex in others:
-            away = vertex.p - before
-            r = dot(away, away).sqrt()
-            at = bodies.points(vertex.held)
-            slid = x + away * (dot(vertex.n, at - x) / dot(vertex.n, away))
-            x, before = at + (slid - at) * self.frame.share(vertex.held.prim, r), vertex.p
-        return x
+        chain = [(before, vertex) for before, vertex in zip(self.vertices, others, strict=False)]
+        for before, vertex in reversed(chain):
+            away = vertex.p - before.p
+            share = self.frame.share(vertex.held.prim, dot(away, away).sqrt())
+            # The point of the vertex, in the part that slides, is that of the vertex before moved along the ray.
+            slid = vertex.n * (dot(away, cotangent) / dot(vertex.n, away))
+            asked.of_points(vertex.held, cotangent * (1.0 - share) + slid * share)
+            cotangent = (cotangent - slid) * share
+        if self.frame.holds_first:
+            asked.of_points(first.held, cotangent)
+            return
+        o, d = self.frame.bodies.film.rays(self.place, self.lens)
+        steep = dot(first.n, d)
+        slid = first.n * (dot(d, cotangent) / steep)
+        asked.of_points(first.held, slid)
+        if self.frame.camera_moves:
+            rest = cotangent - slid
+            asked.of_rays(self.place, self.lens, rest, rest * (dot(first.n, first.p - o) / steep))
 
 
 def prefixes_of(
@@ -213,8 +226,7 @@ def prefixes_of(
             back = take(wi, index).to(spot.p)
             own = None if side is None else take(side, index)
             sent = seen.sent(wo.to(spot.p), back, own).double()
-            _, jacobian = slopes(frame.bodies.camera, seen.p.double(), lens)
-            area = dot(cross(jacobian[0], jacobian[1]), seen.n.double()).abs()
+            area = frame.bodies.film.area(seen.p.double(), seen.n.double(), lens)
             weight = frame.worth.at(place) * sent * take(carried, index) * area
             prefix = Prefix(frame, take(lane, index), weight, place, lens, chain, rows(columns, index))
             counts = (weight != 0).any(0)
@@ -280,16 +292,15 @@ def _seen(frame: MovingFrame, spot: Spot, passing: Passing) -> tuple[Tensor, Ten
 
     ``passing``: decides which surfaces between them rays pass by their opacity; its numbers choose points on the lens too.
     """
-    camera, x = frame.bodies.camera, spot.p.double()
+    film, x = frame.bodies.film, spot.p.double()
     lens = frame.traced.lens(passing.key, passing.depth)
-    seen = camera.film_of(x, lens)
-    assert seen is not None
-    s = film_places(camera, x, lens)
-    width, height = camera.resolution
+    seen = film.of(x, lens)
+    s = flat_places(seen)
+    width, height = frame.bodies.camera.resolution
     good = (seen[2] > 0) & (seen[3] > 0) & (s > -_MARGIN).all(0) & (s[0] < width + _MARGIN) & (s[1] < height + _MARGIN)
     index = good.nonzero().squeeze(1)
     s, x, lens = rows((s, x, lens), index)
-    o, d = camera.rays(s[0], s[1], lens)
+    o, d = film.rays(s, lens)
     o = o.expand_as(d)
     # From the point: the rounding of a ray from far away is more than what may lie before the point.
     n, prim = take(spot.n, index).double(), take(spot.hit.prim, index)

@@ -24,10 +24,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
+from torchpt.gradients.edges.asked import Asked
 from torchpt.gradients.edges.bodies import Bodies, Held
 from torchpt.gradients.edges.curves import smooth_faces
 from torchpt.gradients.edges.cuts import Crossing, crossing_of
@@ -293,6 +295,7 @@ class SegmentSamples:
     """Samples of segments; the derivative of the loss is that of :meth:`sum`.
 
     Attributes:
+        frame: of the interior.
         number: of the samples ``(N,)``.
         edge: the places on edges.
         mate: the other face at each ``(N,)``; -1: there is none.
@@ -303,6 +306,7 @@ class SegmentSamples:
         crossing: those of the places where surfaces cut.
     """
 
+    frame: MovingFrame
     number: Tensor
     edge: Held
     mate: Tensor
@@ -314,35 +318,50 @@ class SegmentSamples:
 
     def sum(self, bodies: Bodies) -> Tensor:
         """Return a number, differentiable in ``bodies``; of no meaning but for its derivative."""
-        value = torch.zeros((), dtype=self.r.dtype, device=self.r.device)
-        p = bodies.points(self.edge)
-        e = dot(self.m, p if self.crossing is None else self.crossing.moved(bodies, p))
-        ends = [dot(self.m, bodies.points(side.held)) for side in self.sides]
-        for prefix, light in self.prefixes:
-            lane = prefix.lane
-            x = dot(take(self.m, lane), prefix.receivers(bodies))
-            c = take(e, lane) - x
-            for side, end, arrives in zip(self.sides, ends, light, strict=True):
-                d = (take(end, lane) - x) * take(self.r / side.r, lane)
-                value = value - side.sign * ((c - (1.0 - take(side.share, lane)) * d) * arrives).sum()
-        return value
+        asked, motions = Asked(self.frame.moves), self._motions
+        edge = self.m * motions.edge
+        asked.of_points(self.edge, edge)
+        if self.crossing is not None:
+            self.crossing.ask(asked, edge)
+        for side, end in zip(self.sides, motions.ends, strict=True):
+            asked.of_points(side.held, self.m * end)
+        for (prefix, _), receivers in zip(self.prefixes, motions.receivers, strict=True):
+            prefix.ask(asked, take(self.m, prefix.lane) * receivers)
+        return asked.sum(bodies)
 
-    def brought(self, frame: MovingFrame) -> Tensor:
+    def brought(self) -> Tensor:
         """Return the root of the sum of squares ``(N,)`` of the derivatives by how far edges, receivers and ends move."""
-        size = torch.zeros_like(self.r)
-        edge, ends, receivers = size.clone(), [size.clone() for _ in self.sides], size.clone()
-        for prefix, light in self.prefixes:
-            lane, x = prefix.lane, torch.zeros_like(light[0])
-            for side, end, arrives in zip(self.sides, ends, light, strict=True):
-                turned = take((1.0 - side.share) * self.r / side.r, lane) * arrives
-                end.index_add_(0, lane, turned)
-                edge.index_add_(0, lane, side.sign * arrives)
-                x += side.sign * (arrives - turned)
-            receivers.index_add_(0, lane, x.abs() * prefix.motion())
-        square = (frame.moving(self.edge.prim) | frame.moving(self.mate)) * edge.square() + receivers.square()
-        for side, end in zip(self.sides, ends, strict=True):
+        motions, receivers = self._motions, torch.zeros_like(self.r)
+        for (prefix, _), of_prefix in zip(self.prefixes, motions.receivers, strict=True):
+            receivers.index_add_(0, prefix.lane, of_prefix.abs() * prefix.motion())
+        moves = self.frame.moving(self.edge.prim) | self.frame.moving(self.mate)
+        square = moves * motions.edge.square() + receivers.square()
+        for side, end in zip(self.sides, motions.ends, strict=True):
             square += side.moves * end.square()
         return square.sqrt()
+
+    @cached_property
+    def _motions(self) -> Motions:
+        edge, ends, receivers = torch.zeros_like(self.r), [torch.zeros_like(self.r) for _ in self.sides], list[Tensor]()
+        turns = [side.sign * (1.0 - side.share) * self.r / side.r for side in self.sides]
+        for prefix, light in self.prefixes:
+            lane, x = prefix.lane, torch.zeros_like(light[0])
+            for side, turn, end, arrives in zip(self.sides, turns, ends, light, strict=True):
+                turned = take(turn, lane) * arrives
+                end.index_add_(0, lane, turned)
+                edge.index_add_(0, lane, arrives, alpha=-side.sign)
+                x += side.sign * arrives - turned
+            receivers.append(x)
+        return Motions(edge, ends, receivers)
+
+
+@dataclass(frozen=True)
+class Motions:
+    """Derivatives by motions along ``m``: of edges ``(N,)``, of the ends on both sides, and of each prefix's receivers ``(M,)``."""
+
+    edge: Tensor
+    ends: list[Tensor]
+    receivers: list[Tensor]
 
 
 @dataclass(frozen=True)
@@ -371,7 +390,7 @@ class Segments:
         rays, spot, lane = self._receivers(self.sampler.draw(u[0], u[1:], aim, coins), key)
         found = self._samples(rays, spot, *rows((number, key, scale), lane)) if len(lane) else None
         if turn.memory is not None and found is not None:
-            brought = torch.zeros_like(scale).index_add_(0, found.number - number[0], found.brought(self.frame))
+            brought = torch.zeros_like(scale).index_add_(0, found.number - number[0], found.brought())
             turn.record(u, scale, brought)
         return found
 
@@ -434,7 +453,7 @@ class Segments:
             return None
         sides = [self._side(sign, y, r) for sign, y in zip(_SIGNS, seen, strict=True)]
         crossing = crossing_of(self.frame.bodies, rays.cut, rays.held, rays.mate)
-        return SegmentSamples(number, rays.held, rays.mate, rays.m, r, sides, prefixes, crossing)
+        return SegmentSamples(self.frame, number, rays.held, rays.mate, rays.m, r, sides, prefixes, crossing)
 
     def _ends_at(self, rays: SegmentRays, y: Spot, r: Tensor, step: Tensor) -> Tensor:
         """Return a mask ``(N,)`` of rays beside edges that do not end before these, but for what touches there."""

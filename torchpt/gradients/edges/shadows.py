@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchpt.gradients.edges.asked import Asked
 from torchpt.gradients.edges.bodies import Bodies, Held
 from torchpt.gradients.edges.curves import View
 from torchpt.gradients.edges.occluders import Occluders, OutlinePoints
@@ -223,6 +224,8 @@ class Cast:
     """Samples of shadow edges; the derivative of the loss is that of :meth:`sum`.
 
     Attributes:
+        frame: of the interior.
+        lights_move: True: lights may move.
         beam: where light comes from.
         source: ``(N,)`` column of ``Bodies.lights``, -1 for what is held on a surface, -2 for what does not move.
         edge: the places past which it goes.
@@ -231,6 +234,8 @@ class Cast:
         prefixes: of the receivers, each with weights ``(3, M)`` of their motion over the receiver.
     """
 
+    frame: MovingFrame
+    lights_move: bool
     beam: Beam
     source: Tensor
     edge: Held
@@ -240,22 +245,32 @@ class Cast:
 
     def sum(self, bodies: Bodies) -> Tensor:
         """Return a number, differentiable in ``bodies``; of no meaning but for its derivative."""
-        e, w = self._from(bodies), self.beam.view.w
-        p, held = bodies.points(self.edge), bodies.points(self.receiver)
-        toward = e - p * w
-        x = p - toward * (dot(self.normal, p - held) / dot(self.normal, toward))
-        value = torch.zeros((), dtype=x.dtype, device=x.device)
+        asked, still = Asked(self.frame.moves), self.frame.bodies
+        p, n, w = still.points(self.edge), self.normal, self.beam.view.w
+        x = torch.zeros_like(p)
         for prefix, weight in self.prefixes:
-            value = value + ((take(x, prefix.lane) - prefix.receivers(bodies)) * weight).sum()
-        return value
+            x.index_add_(1, prefix.lane, weight)
+            prefix.ask(asked, -weight)
+        # Light goes from e past p to the receiver's plane: to p - toward (n . (p - held)) / (n . toward).
+        toward = self.beam.view.toward(p)
+        steep = dot(n, toward)
+        far = dot(n, p - still.points(self.receiver)) / steep
+        on_plane = n * (dot(x, toward) / steep)
+        rest = x - on_plane
+        asked.of_points(self.receiver, on_plane)
+        asked.of_points(self.edge, rest * (1.0 + far * w))
+        self._ask_lights(asked, rest * -far)
+        return asked.sum(bodies)
 
-    def _from(self, bodies: Bodies) -> Tensor:
-        e = torch.where(self.source == -1, bodies.points(self.beam.held), self.beam.view.e)
-        if not bodies.lights.shape[1]:
-            return e
-        own = take(bodies.lights, self.source.clamp_min(0))
-        far = torch.as_tensor(self.beam.view.w, device=e.device) == 0
-        return torch.where(self.source >= 0, torch.where(far, -own, own), e)
+    def _ask_lights(self, asked: Asked, cotangent: Tensor) -> None:
+        """Add what a cotangent ``(3, N)`` of where light comes from asks."""
+        surface = (self.source == -1).nonzero().squeeze(1)
+        asked.of_points(rows(self.beam.held, surface), take(cotangent, surface))
+        own = (self.source >= 0).nonzero().squeeze(1)
+        if len(own) and self.lights_move:
+            far = torch.as_tensor(self.beam.view.w, device=own.device) == 0
+            cotangent = torch.where(far, -cotangent, cotangent)  # distant lights are where they go
+            asked.of_lights(take(self.source, own), take(cotangent, own))
 
 
 @dataclass(frozen=True)
@@ -369,7 +384,8 @@ class Shadows:
             prefixes.append((prefix, take(edge, prefix.lane) * value))
         if not prefixes:
             return None
-        return Cast(beam, self._source(beam), passed.held, spot.held(self.frame.bodies), n, prefixes)
+        source, receiver = self._source(beam), spot.held(self.frame.bodies)
+        return Cast(self.frame, self.lights_move, beam, source, passed.held, receiver, n, prefixes)
 
     def _source(self, beam: Beam) -> Tensor:
         """Return columns of ``Bodies.lights``; see :class:`Cast`."""
