@@ -9,7 +9,7 @@ line of sight there, so that its points and the outline have the same motion acr
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
@@ -124,17 +124,20 @@ class Bodies:
     def boxes(self, prim: Tensor) -> tuple[Tensor, Tensor]:
         """Return lower and upper corners ``(3, N)`` of boxes about primitives ``(N,)``."""
         p0, x, y, z = self.place(prim)
-        zero = torch.zeros_like(p0)
+        low, high = torch.minimum(x, y).clamp_max(0.0), torch.maximum(x, y).clamp_min(0.0)
         triangle = self.is_triangle(prim)
         four = ~triangle & (prim < sum(self.counts[:2]))
-        corners = torch.stack((zero, x, y, torch.where(four, x + y, zero)))
-        low, high = corners.amin(0), corners.amax(0)
-        ring = (x * x + y * y).sqrt()
-        ball = (x * x + y * y + z * z).sqrt()
-        tall = ~self.is_flat(prim) & torch.isfinite(self.forms_of(prim)[3])
-        for mask, reach, up in ((~triangle & ~four, ball, zero), (tall, ring, z)):
-            low = torch.where(mask, -reach + torch.minimum(up, zero), low)
-            high = torch.where(mask, reach + torch.maximum(up, zero), high)
+        if self.counts[1]:
+            fourth = torch.where(four, x + y, 0.0)
+            low, high = torch.minimum(low, fourth), torch.maximum(high, fourth)
+        if any(self.counts[2:]):
+            zero = torch.zeros_like(p0)
+            ring = (x * x + y * y).sqrt()
+            ball = (x * x + y * y + z * z).sqrt()
+            tall = ~self.is_flat(prim) & torch.isfinite(self.forms_of(prim)[3])
+            for mask, reach, up in ((~triangle & ~four, ball, zero), (tall, ring, z)):
+                low = torch.where(mask, -reach + torch.minimum(up, zero), low)
+                high = torch.where(mask, reach + torch.maximum(up, zero), high)
         return p0 + low, p0 + high
 
     def rounding(self, along: Tensor, *prims: Tensor) -> Tensor:
@@ -144,9 +147,13 @@ class Bodies:
 
     def points(self, held: Held) -> Tensor:
         """Return where points are ``(3, N)``."""
-        p0, x, y, z = self.place(held.prim)
-        p = affine(p0, x, held.a[0], y, held.a[1])
-        return torch.addcmul(p, z, held.a[2]) if self.counts[3] or self.counts[4] else p
+        p0, *axes = self.place(held.prim)
+        return p0 + self.vectors(axes, held.a)
+
+    def vectors(self, axes: Sequence[Tensor], a: Tensor) -> Tensor:
+        """Return vectors ``(3, N)`` of numbers ``a (3, N)`` along the axes of :meth:`place`."""
+        flat = torch.addcmul(axes[0] * a[0], axes[1], a[1])
+        return torch.addcmul(flat, axes[2], a[2]) if self.counts[3] or self.counts[4] else flat
 
     def own(self, prim: Tensor, p: Tensor) -> Tensor:
         """Return the numbers ``(3, N)`` of points ``p (3, N)`` of primitives."""
