@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from torchpt.core.errors import EdgeWarning, warn_caller
-from torchpt.gradients.edges.asked import Asked
+from torchpt.gradients.edges.cotangents import Cotangents
 from torchpt.gradients.edges.bodies import ROUNDING, Bodies, Held
 from torchpt.gradients.edges.curves import Curves, circles, corners, joined, known, straight
 from torchpt.gradients.edges.meshes import neighbours_of
@@ -73,11 +73,11 @@ class Crossing:
         apart = dot(self.across, bodies.points(self.other) - take(p, self.lane))
         return p.index_add(1, self.lane, self.shift * apart)
 
-    def ask(self, asked: Asked, cotangent: Tensor) -> None:
+    def pull_back(self, cotangents: Cotangents, cotangent: Tensor) -> None:
         """Add what a cotangent ``(3, N)`` of :meth:`moved` points asks, beside itself of the points on their own surfaces."""
         apart = dot(self.shift, take(cotangent, self.lane))
-        asked.of_points(self.other, self.across * apart)
-        asked.of_points(self.own, self.across * -apart)
+        cotangents.add_points(self.other, self.across * apart)
+        cotangents.add_points(self.own, self.across * -apart)
 
 
 def crossing_of(bodies: Bodies, cut: Tensor, held: Held, mate: Tensor) -> Crossing | None:

@@ -41,16 +41,17 @@ class Worth:
 
     def at(self, s: Tensor) -> Tensor:
         """Return ``(C, N)`` at places ``s (2, N)`` of the film, in pixels."""
-        columns, rows = (self._taps(s[k], self._crop[k], self._crop[k + 2]) for k in range(2))
         total = torch.zeros(len(self._values), s.shape[1], dtype=torch.float64, device=s.device)
-        for y, across in rows:
-            for x, along in columns:
-                total += take(self._values, y * self._crop[2] + x) * (along * across)
+        taps = self._taps(s)
+        for pixel_y, across in ((pixel[1], weight[1]) for pixel, weight, some in taps if some[1]):
+            for pixel_x, along in ((pixel[0], weight[0]) for pixel, weight, some in taps if some[0]):
+                total += take(self._values, pixel_y * self._crop[2] + pixel_x) * (along * across)
         return total
 
-    def _taps(self, s: Tensor, low: int, size: int) -> list[tuple[Tensor, Tensor]]:
-        """Return pixels ``(N,)`` along one axis that see a coordinate, each with the filter there; 0 off the film."""
+    def _taps(self, s: Tensor) -> list[tuple[Tensor, Tensor, list[bool]]]:
+        """Return pixels that see places, along both axes: ``(2, N)``, the filter there, 0 off the film, and where any is not."""
         radius, found = self._filter.radius, []
+        low, size = torch.tensor(self._crop, device=s.device)[:, None].split(2)
         first = torch.ceil(s - 0.5 - radius).long() - low
         for k in range(math.floor(2.0 * radius) + 1):
             pixel = first + k
@@ -58,10 +59,9 @@ class Worth:
             weight = torch.from_numpy(self._filter.profile(away.cpu().numpy())).to(s.device) / self._whole
             # A box ends at once: a place on the border of two pixels is half in each.
             weight = torch.where(away.abs() == radius, 0.5 * weight, weight)
-            inside = pixel.clamp(0, size - 1)
+            inside = torch.minimum(pixel.clamp_min(0), size - 1)
             weight = torch.where(inside == pixel, weight, 0.0)
-            if bool((weight != 0).any()):  # the last tap of a box is 0 but for ties
-                found.append((inside, weight))
+            found.append((inside, weight, (weight != 0).any(1).tolist()))  # the last tap of a box is 0 but for ties
         return found
 
 

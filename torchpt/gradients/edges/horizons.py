@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchpt.gradients.edges.asked import Asked
+from torchpt.gradients.edges.cotangents import Cotangents
 from torchpt.gradients.edges.bodies import Bodies, Held
 from torchpt.gradients.edges.curves import smooth_faces
 from torchpt.gradients.edges.receivers import MovingFrame, Prefix, prefixes_of
@@ -62,18 +62,18 @@ class HorizonSamples:
 
     def sum(self, bodies: Bodies) -> Tensor:
         """Return a number, differentiable in ``bodies``; of no meaning but for its derivative."""
-        asked, opens, ends = Asked(self.frame.moves), torch.zeros_like(self.r), torch.zeros_like(self.r)
+        cotangents, opens, ends = Cotangents(self.frame.moves), torch.zeros_like(self.r), torch.zeros_like(self.r)
         turns = (1.0 - self.share) / self.r
         for prefix, light in self.prefixes:
             turned = take(turns, prefix.lane) * light
             opens.index_add_(0, prefix.lane, light)
             ends.index_add_(0, prefix.lane, turned)
-            prefix.ask(asked, take(self.n, prefix.lane) * -turned)
-        asked.of_points(self.seen, self.n * ends)
+            prefix.pull_back(cotangents, take(self.n, prefix.lane) * -turned)
+        cotangents.add_points(self.seen, self.n * ends)
         _, x, y, _ = bodies.place(self.face.prim)
         n = normalize(cross(x, y))
         turning = dot(n * torch.sign(dot(n.detach(), self.n)), self.omega)
-        return (turning * opens).sum() + asked.sum(bodies)
+        return (turning * opens).sum() + cotangents.sum(bodies)
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from torchpt.gradients.edges.asked import Asked
+from torchpt.gradients.edges.cotangents import Cotangents
 from torchpt.gradients.edges.bodies import Bodies, Held
 from torchpt.gradients.edges.film import Worth, flat_places
 from torchpt.gradients.edges.traced import Passing, Traced
@@ -46,8 +46,6 @@ _ROULETTE = 3
 _TO_CAMERA = 1 << 12
 #: What is met so far from a point, against the way to the camera, is behind that.
 _TO_LENS = 2.0**-20
-#: Pixels beside the film that are looked at, for wide filters.
-_MARGIN = 16.0
 
 
 @dataclass(frozen=True)
@@ -87,6 +85,13 @@ class MovingFrame:
     def lift(self, prim: Tensor, n: Tensor) -> Tensor:
         """Return how far off primitives ``(N,)`` rays begin along their normals ``n (3, N)``; little if these are axes."""
         return _LIFT * self.bodies.rounding(n, prim)
+
+    def emits(self, prim: Tensor) -> Tensor:
+        """Return a mask of primitives ``(N,)`` that emit light."""
+        world = self.traced.wave.context.world
+        if world.lights is None or world.lights.row_of_prim is None:
+            return torch.zeros_like(prim, dtype=torch.bool)
+        return take(world.lights.row_of_prim, world.geometry.slot(prim)) >= 0
 
     def moving(self, prim: Tensor) -> Tensor:
         """Return a mask ``(N,)`` of primitives that move; False where ``prim`` is -1."""
@@ -163,12 +168,12 @@ class Prefix:
             how = (1.0 - share) * self.frame.moving(vertex.held.prim) + share * how
         return how
 
-    def ask(self, asked: Asked, cotangent: Tensor) -> None:
-        """Add to ``asked`` what a cotangent of the receivers in the interior's frame ``(3, M)`` asks of all that moves them."""
+    def pull_back(self, cotangents: Cotangents, cotangent: Tensor) -> None:
+        """Add the cotangents of all that moves receivers, by one of where these are in the interior's frame ``(3, M)``."""
         some = self.moves().nonzero().squeeze(1)
         if len(some) < len(self.lane):
             if len(some):
-                self.taken(some).ask(asked, take(cotangent, some))
+                self.taken(some).pull_back(cotangents, take(cotangent, some))
             return
         first, *others = self.vertices
         chain = [(before, vertex) for before, vertex in zip(self.vertices, others, strict=False)]
@@ -177,18 +182,18 @@ class Prefix:
             share = self.frame.share(vertex.held.prim, dot(away, away).sqrt())
             # The point of the vertex, in the part that slides, is that of the vertex before moved along the ray.
             slid = vertex.n * (dot(away, cotangent) / dot(vertex.n, away))
-            asked.of_points(vertex.held, cotangent * (1.0 - share) + slid * share)
+            cotangents.add_points(vertex.held, cotangent * (1.0 - share) + slid * share)
             cotangent = (cotangent - slid) * share
         if self.frame.holds_first:
-            asked.of_points(first.held, cotangent)
+            cotangents.add_points(first.held, cotangent)
             return
         o, d = self.frame.bodies.film.rays(self.place, self.lens)
         steep = dot(first.n, d)
         slid = first.n * (dot(d, cotangent) / steep)
-        asked.of_points(first.held, slid)
+        cotangents.add_points(first.held, slid)
         if self.frame.camera_moves:
             rest = cotangent - slid
-            asked.of_rays(self.place, self.lens, rest, rest * (dot(first.n, first.p - o) / steep))
+            cotangents.add_rays(self.place, self.lens, rest, rest * (dot(first.n, first.p - o) / steep))
 
 
 def prefixes_of(
@@ -219,8 +224,10 @@ def prefixes_of(
     lane = torch.arange(wi.shape[1], device=wi.device)
     carried = torch.ones_like(wi)
     chain, columns = (_vertex(frame, spot),), (lane,)
+    every = moves is None or (frame.camera_moves and not frame.holds_first)
+    counts = torch.ones_like(lane, dtype=torch.bool) if every else moves | frame.moving(spot.hit.prim)
     for k in range(1, longest + 1):
-        index, place, lens, wo = _seen(frame, spot, Passing(take(key, lane), _TO_CAMERA + k))
+        index, place, lens, wo = _seen(frame, spot, counts, Passing(take(key, lane), _TO_CAMERA + k))
         if len(index):
             seen = spot.taken(index)
             back = take(wi, index).to(spot.p)
@@ -229,10 +236,7 @@ def prefixes_of(
             area = frame.bodies.film.area(seen.p.double(), seen.n.double(), lens)
             weight = frame.worth.at(place) * sent * take(carried, index) * area
             prefix = Prefix(frame, take(lane, index), weight, place, lens, chain, rows(columns, index))
-            counts = (weight != 0).any(0)
-            if moves is not None:
-                counts &= prefix.moves() | take(moves, prefix.lane)
-            some = counts.nonzero().squeeze(1)
+            some = (weight != 0).any(0).nonzero().squeeze(1)
             if len(some):
                 found.append(prefix.taken(some))
         if k == longest:
@@ -252,6 +256,7 @@ def prefixes_of(
         if not len(kept):
             break
         lane, carried, spot = take(lane, kept), take(carried, kept), spot.taken(some)
+        counts = take(counts, kept) | frame.moving(spot.hit.prim)
         chain = _vertex(frame, spot), *chain
         columns = torch.arange(len(kept), device=wi.device), *rows(columns, kept)
         wi = -spot.d.double()
@@ -287,18 +292,20 @@ def _vertex(frame: MovingFrame, spot: Spot) -> PathVertex:
     return PathVertex(spot.held(frame.bodies), spot.p.double(), spot.n.double())
 
 
-def _seen(frame: MovingFrame, spot: Spot, passing: Passing) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
-    """Return which points the camera sees ``(n,)``, their places on the film and on the lens, and directions to the camera.
+def _seen(
+    frame: MovingFrame, spot: Spot, counts: Tensor, passing: Passing
+) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
+    """Return which points the picture sees ``(n,)``, their places on the film and on the lens, and directions to the camera.
 
-    ``passing``: decides which surfaces between them rays pass by their opacity; its numbers choose points on the lens too.
+    ``counts``: mask ``(N,)`` of the points that are looked at. ``passing``: decides which surfaces between them rays pass by their opacity; its numbers choose points on the lens too.
     """
     film, x = frame.bodies.film, spot.p.double()
     lens = frame.traced.lens(passing.key, passing.depth)
     seen = film.of(x, lens)
     s = flat_places(seen)
-    width, height = frame.bodies.camera.resolution
-    good = (seen[2] > 0) & (seen[3] > 0) & (s > -_MARGIN).all(0) & (s[0] < width + _MARGIN) & (s[1] < height + _MARGIN)
-    index = good.nonzero().squeeze(1)
+    x0, x1, y0, y1 = frame.worth.bounds()
+    counts = counts & (seen[2] > 0) & (seen[3] > 0) & (s[0] >= x0) & (s[0] <= x1) & (s[1] >= y0) & (s[1] <= y1)
+    index = counts.nonzero().squeeze(1)
     s, x, lens = rows((s, x, lens), index)
     o, d = film.rays(s, lens)
     o = o.expand_as(d)
@@ -307,6 +314,5 @@ def _seen(frame: MovingFrame, spot: Spot, passing: Passing) -> tuple[Tensor, Ten
     lift = torch.maximum(frame.lift(prim, n), largest(x.abs()) * _ROUNDING)
     begin = x - n * (torch.sign(dot(n, d)) * lift)
     passing = replace(passing, key=take(passing.key, index))
-    t, _ = frame.traced.nearest(begin, -d, passing)
-    some = (t > dot(begin - o, d) * (1.0 - _TO_LENS)).nonzero().squeeze(1)
+    some = (~frame.traced.blocked(begin, -d, dot(begin - o, d) * (1.0 - _TO_LENS), passing)).nonzero().squeeze(1)
     return take(index, some), take(s, some), rows(lens, some), -take(d, some)

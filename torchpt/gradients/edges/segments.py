@@ -29,7 +29,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from torchpt.gradients.edges.asked import Asked
+from torchpt.gradients.edges.cotangents import Cotangents
 from torchpt.gradients.edges.bodies import Bodies, Held
 from torchpt.gradients.edges.curves import smooth_faces
 from torchpt.gradients.edges.cuts import Crossing, crossing_of
@@ -318,16 +318,16 @@ class SegmentSamples:
 
     def sum(self, bodies: Bodies) -> Tensor:
         """Return a number, differentiable in ``bodies``; of no meaning but for its derivative."""
-        asked, motions = Asked(self.frame.moves), self._motions
+        cotangents, motions = Cotangents(self.frame.moves), self._motions
         edge = self.m * motions.edge
-        asked.of_points(self.edge, edge)
+        cotangents.add_points(self.edge, edge)
         if self.crossing is not None:
-            self.crossing.ask(asked, edge)
+            self.crossing.pull_back(cotangents, edge)
         for side, end in zip(self.sides, motions.ends, strict=True):
-            asked.of_points(side.held, self.m * end)
+            cotangents.add_points(side.held, self.m * end)
         for (prefix, _), receivers in zip(self.prefixes, motions.receivers, strict=True):
-            prefix.ask(asked, take(self.m, prefix.lane) * receivers)
-        return asked.sum(bodies)
+            prefix.pull_back(cotangents, take(self.m, prefix.lane) * receivers)
+        return cotangents.sum(bodies)
 
     def brought(self) -> Tensor:
         """Return the root of the sum of squares ``(N,)`` of the derivatives by how far edges, receivers and ends move."""
@@ -442,15 +442,17 @@ class Segments:
         for y in seen:
             moves = moves | self.frame.moving(y.hit.prim)
         found = prefixes_of(self.frame, receiver, -rays.omega, key, self.depth, behind=2, moves=moves)
-        prefixes = []
         # Light behind the edge costs more than paths to the camera.
-        for prefix in one_of_each(found, self.frame.traced.draws(key).one(Dimension.ROULETTE).double()):
-            depth = self.depth if self.depth < 0 else self.depth - prefix.count
-            scale = prefix.weight * take(weight, prefix.lane)
-            light = self._reflected(seen, free, number, prefix.lane, depth)
-            prefixes.append((prefix, (scale[:, None] * light).sum(0)))
-        if not prefixes:
+        chosen = one_of_each(found, self.frame.traced.draws(key).one(Dimension.ROULETTE).double())
+        if not chosen:
             return None
+        depths = [self.depth if self.depth < 0 else self.depth - prefix.count for prefix in chosen]
+        light = self._reflected(seen, free, number, [prefix.lane for prefix in chosen], depths)
+        prefixes = []
+        for prefix in chosen:
+            scale = prefix.weight * take(weight, prefix.lane)
+            arrives = take(light.view(6, -1), prefix.lane).view(3, 2, -1)
+            prefixes.append((prefix, (scale[:, None] * arrives).sum(0)))
         sides = [self._side(sign, y, r) for sign, y in zip(_SIGNS, seen, strict=True)]
         crossing = crossing_of(self.frame.bodies, rays.cut, rays.held, rays.mate)
         return SegmentSamples(self.frame, number, rays.held, rays.mate, rays.m, r, sides, prefixes, crossing)
@@ -475,23 +477,41 @@ class Segments:
         share, moves = self.frame.share(y.hit.prim, reach), self.frame.moving(y.hit.prim)
         return Side(sign, y.held(self.frame.bodies), reach, share, moves)
 
-    def _reflected(self, seen: list[Spot], free: Tensor, number: Tensor, lane: Tensor, depth: int) -> Tensor:
-        """Return the light ``(3, 2, M)`` that what was met reflects in lanes ``(M,)``, by paths of so many vertices.
+    def _reflected(
+        self, seen: list[Spot], free: Tensor, number: Tensor, lanes: list[Tensor], depths: list[int]
+    ) -> Tensor:
+        """Return the light ``(3, 2, N)`` that what was met reflects, by paths of so many vertices.
 
-        ``free``: distances before which surfaces that are not opaque let everything pass.
+        Args:
+            seen: what was met on both sides.
+            free: distances ``(N,)`` before which surfaces that are not opaque let everything pass.
+            number: of the samples ``(N,)``.
+            lanes: groups of lanes, none of which is in two groups; in others there is no light.
+            depths: vertices of paths at most, of each group.
         """
-        found = torch.zeros(3, len(seen) * len(lane), dtype=torch.float64, device=lane.device)
-        met_some = torch.cat([take(y.hit.prim, lane) for y in seen]) >= 0
-        some = met_some.nonzero().squeeze(1)
-        if len(some):
-            traced, mine = self.frame.traced, torch.cat([lane] * len(seen))
-            o, d = (
-                torch.cat([take(t, lane) for t in sides], 1) for sides in zip(*((y.o, y.d) for y in seen), strict=True)
-            )
-            if traced.has_opacity:
-                t = torch.cat([torch.minimum(free, y.hit.t.double() * (1.0 - _NEAR))[lane] for y in seen])
-                o = o.double() + d.double() * t.clamp_min(0.0)
-            rays = take(o, some), take(d, some).double(), take(number, take(mine, some)), Use.BEHIND
-            radiance = traced.radiance(*rays, depth)
-            found[:, some] = radiance - traced.radiance(*rays, 1)  # without light of sources themselves
-        return found.view(3, len(seen), -1)
+        traced, n = self.frame.traced, len(number)
+        o, d = (torch.cat(both, 1) for both in zip(*((y.o, y.d) for y in seen), strict=True))
+        prim = torch.cat([y.hit.prim for y in seen])
+        if traced.has_opacity:
+            t = torch.cat([torch.minimum(free, y.hit.t.double() * (1.0 - _NEAR)) for y in seen])
+            o = o.double() + d.double() * t.clamp_min(0.0)
+        found = torch.zeros(3, 2 * n, dtype=torch.float64, device=number.device)
+
+        def add(index: Tensor, depth: int, sign: float) -> None:
+            if len(index):
+                rays = take(o, index), take(d, index).double(), take(number, index % n), Use.BEHIND
+                found.index_add_(1, index, traced.radiance(*rays, depth), alpha=sign)
+
+        met_some = []
+        for depth in dict.fromkeys(depths):
+            same = [lane for lane, of_lane in zip(lanes, depths, strict=True) if of_lane == depth]
+            index = torch.cat([lane + side * n for side in range(len(seen)) for lane in same])
+            index = take(index, (take(prim, index) >= 0).nonzero().squeeze(1))
+            add(index, depth, 1.0)
+            met_some.append(index)
+        # Without light of sources themselves; where rays pass nothing it is known which of them meet any.
+        index = torch.cat(met_some)
+        if not traced.has_opacity:
+            index = take(index, self.frame.emits(take(prim, index)).nonzero().squeeze(1))
+        add(index, 1, -1.0)
+        return found.view(3, len(seen), n)
