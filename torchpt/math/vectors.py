@@ -104,7 +104,7 @@ def take(table: Tensor, index: Tensor | None) -> Tensor:
         taken = gathers.take(table, index)
         if taken is not None:
             return taken
-    if table.dim() == 2 and len(index) >= _MANY and table.dtype is not torch.float32 and table.is_cpu:
+    if table.dtype is not torch.float32 and table.dim() == 2 and index.shape[0] >= _MANY and table.is_cpu:
         # torch's index_select is vectorized for float32 alone.
         return torch.gather(table, 1, index.long().expand(len(table), -1))
     return torch.index_select(table, table.dim() - 1, index)

@@ -61,8 +61,8 @@ _SHARE, _LEAST = 0.25, 2.0**-6
 def step_of(bodies: Bodies) -> float:
     """Return a whole step, in pixels: a few hundred roundings of a ray's direction."""
     width = float(max(bodies.camera.resolution))
-    spread = float(bodies.camera.pixel()[4]) * width  # of the film at distance 1
-    narrow = max(1.0, 1.0 / spread) if float(bodies.camera.pixel()[3]) else 1.0
+    *_, place, side = bodies.camera.pixel().tolist()
+    narrow = max(1.0, 1.0 / (side * width)) if place else 1.0  # by the film at distance 1
     return _STEP * width * narrow
 
 
@@ -80,17 +80,24 @@ def steps_at(bodies: Bodies, faces: tuple[Tensor, Tensor], s: Tensor, lens: Tens
     for prim in faces:
         some = is_flat(bodies, prim).nonzero().squeeze(1)
         if len(some):
-            corners = outline_of(bodies, prim[some], rows(lens, some))
-            away = torch.stack([distance_to(s[:, some], a, b) for a, b in corners])
-            # The nearest is the edge itself.
-            room[some] = torch.minimum(room[some], away.sort(0).values[1])
+            nearest, *others = distance_to(take(s, some), *outline_of(bodies, take(prim, some), rows(lens, some)))
+            second = take(room, some)
+            for away in others:
+                second = torch.minimum(second, torch.maximum(nearest, away))
+                nearest = torch.minimum(nearest, away)
+            room[some] = second  # the nearest is the edge itself
     return (_SHARE * room).clamp(_LEAST * whole, whole)
 
 
-def outline_of(bodies: Bodies, prim: Tensor, lens: Tensor | None) -> list[tuple[Tensor, Tensor]]:
-    """Return the sides of parallelograms ``(N,)`` on the film, from and to ``(2, N)``; a triangle's last has no length."""
-    places = [bodies.film.places(corner, lens) for corner in bodies.corners(prim)]
-    return list(zip(places, [*places[1:], places[0]], strict=True))
+def outline_of(bodies: Bodies, prim: Tensor, lens: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Return from and to where the sides of triangles and parallelograms ``(N,)`` run on the film, ``(2, sides, N)``.
+
+    There are three sides where the scene has triangles alone; else a triangle has a fourth one of no length.
+    """
+    corners = bodies.corners(prim)[: 4 if bodies.counts[1] else 3]
+    lens = None if lens is None else lens.repeat(1, len(corners))
+    places = bodies.film.places(torch.cat(corners, 1), lens).view(2, len(corners), -1)
+    return places, places.roll(-1, 1)
 
 
 def is_flat(bodies: Bodies, prim: Tensor) -> Tensor:
@@ -99,12 +106,13 @@ def is_flat(bodies: Bodies, prim: Tensor) -> Tensor:
 
 
 def distance_to(s: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """Return distances ``(N,)`` of places ``(2, N)`` from segments ``a b``."""
-    along = b - a
-    square = (along * along).sum(0)
-    share = (((s - a) * along).sum(0) / torch.where(square > 0, square, 1.0)).clamp(0.0, 1.0)
-    away = s - a - along * share
-    return (away * away).sum(0).sqrt()
+    """Return distances ``(sides, N)`` of places ``(2, N)`` from segments between ``a`` and ``b (2, sides, N)``."""
+    x, y = b - a
+    u, v = s[:, None] - a
+    square = torch.addcmul(x * x, y, y)
+    share = (torch.addcmul(u * x, v, y) / torch.where(square > 0, square, 1.0)).clamp(0.0, 1.0)
+    u, v = u - x * share, v - y * share
+    return torch.addcmul(u * u, v, v).sqrt()
 
 
 # ---- Edges of several surfaces that lie on one another, as where two walls of a room meet: each counts in part
@@ -135,7 +143,7 @@ def share_of(
     safe = torch.where(flat, other, 0)
     if not bool(flat.any()):
         return torch.ones_like(step)
-    away = torch.stack([distance_to(s, a, b) for a, b in outline_of(bodies, safe, lens)]).amin(0)
+    away = distance_to(s, *outline_of(bodies, safe, lens)).amin(0)
     return torch.where(flat & (away < 0.5 * step), 0.5, 1.0)
 
 

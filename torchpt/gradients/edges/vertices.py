@@ -70,13 +70,16 @@ class Spot:
             a[:, bent] = torch.stack([dot(face, away) / det for face in faces])
         return Held(prim, a)
 
-    def _each(self, found: list[Tensor], make: Callable[[int, Tensor, Interaction], list[Tensor]]) -> None:
+    def _each(self, found: list[Tensor], make: Callable[[int, Tensor | None, Interaction], list[Tensor]]) -> None:
         """Fill in what each model makes of its lanes."""
-        _, groups = partition(self.traced.wave.context.world, self.hit)
+        world = self.traced.wave.context.world
+        if len(world.materials.models) == 1 and bool((self.hit.prim >= 0).all()):
+            for into, value in zip(found, make(0, None, interact(world, self.o, self.d, self.hit)), strict=True):
+                into.copy_(value)
+            return
+        _, groups = partition(world, self.hit)
         for model, index in groups:
-            at = interact(
-                self.traced.wave.context.world, take(self.o, index), take(self.d, index), rows(self.hit, index)
-            )
+            at = interact(world, take(self.o, index), take(self.d, index), rows(self.hit, index))
             for into, value in zip(found, make(model, index, at), strict=True):
                 into.index_copy_(into.dim() - 1, index, value.to(into.dtype))
 
@@ -88,7 +91,7 @@ class Spot:
         """
         out = torch.zeros_like(wo)
 
-        def make(model: int, index: Tensor, at: Interaction) -> list[Tensor]:
+        def make(model: int, index: Tensor | None, at: Interaction) -> list[Tensor]:
             own = None if side is None else take(side, index)
             return [self._weighed(model, at, take(wo, index), take(wi, index), own)]
 
@@ -127,7 +130,7 @@ class Spot:
         context = self.traced.wave.context
         world = context.world
 
-        def make(model: int, index: Tensor, at: Interaction) -> list[Tensor]:
+        def make(model: int, index: Tensor | None, at: Interaction) -> list[Tensor]:
             kind, back = world.materials.models[model], take(wi, index)
             if kind.smooth:
                 return [torch.zeros_like(at.p), back, torch.zeros_like(back)]
