@@ -21,6 +21,7 @@ __all__ = [
     "cross",
     "dot",
     "inverse_square",
+    "lanes_of",
     "largest",
     "luminance",
     "normalize",
@@ -111,6 +112,12 @@ def take(table: Tensor, index: Tensor | None) -> Tensor:
 
 
 T = TypeVar("T")
+
+
+def lanes_of(mask: Tensor) -> Tensor | None:
+    """Return the lanes ``(n,)`` where a mask is True; None, which :func:`take` knows as all of them, where it is everywhere."""
+    index = mask.nonzero().squeeze(1)
+    return None if index.shape[0] == mask.shape[0] else index
 
 
 def rows(record: T, index: Tensor | None) -> T:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -350,8 +351,10 @@ def parts_of(bodies: Bodies, curves: Curves) -> Tensor:
         code = (
             cells[:, 0] * _MIX[0] + cells[:, 1] * _MIX[1] + cells[:, 2] * _MIX[2]
         )  # (2, N), a point each; it may overflow
-        low, high = code.sort(0).values
-        pair = low + high * _MIX[2]
+        pair = torch.minimum(*code) + torch.maximum(*code) * _MIX[2]
+        in_order = np.sort(pair.cpu().numpy())  # several times faster than torch's
+        if (in_order[1:] != in_order[:-1]).all():
+            continue
         _, group, count = torch.unique(pair, return_inverse=True, return_counts=True)
         parts = torch.minimum(parts, 1.0 / take(count.double(), group))
     length = (ends[1] - ends[0]).square().sum(0).sqrt()

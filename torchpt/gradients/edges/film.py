@@ -52,8 +52,13 @@ class Worth:
         """Return pixels that see places, along both axes: ``(2, N)``, the filter there, 0 off the film, and where any is not."""
         radius, found = self._filter.radius, []
         low, size = torch.tensor(self._crop, device=s.device)[:, None].split(2)
-        first = torch.ceil(s - 0.5 - radius).long() - low
-        for k in range(math.floor(2.0 * radius) + 1):
+        begin = s - 0.5 - radius
+        first = begin.ceil()
+        last = math.floor(2.0 * radius)
+        if last == 2.0 * radius and not bool((first == begin).any()):  # the filter ends within the last but one
+            last -= 1
+        first = first.long() - low
+        for k in range(last + 1):
             pixel = first + k
             away = s - (pixel + low) - 0.5
             weight = torch.from_numpy(self._filter.profile(away.cpu().numpy())).to(s.device) / self._whole
@@ -61,7 +66,7 @@ class Worth:
             weight = torch.where(away.abs() == radius, 0.5 * weight, weight)
             inside = torch.minimum(pixel.clamp_min(0), size - 1)
             weight = torch.where(inside == pixel, weight, 0.0)
-            found.append((inside, weight, (weight != 0).any(1).tolist()))  # the last tap of a box is 0 but for ties
+            found.append((inside, weight, (weight != 0).any(1).tolist()))
         return found
 
 
@@ -77,7 +82,7 @@ class FilmMap:
 
     @cached_property
     def _affine(self) -> tuple[Tensor, Tensor]:
-        """Return the matrix ``(4, 3)`` by which homogeneous places change with points, and the place ``(4, 1)`` of the origin.
+        """Return the matrix ``(4, 3)`` and the vector ``(4, 1)`` by which points become homogeneous places and depths.
 
         They are those of a camera without a lens, or of the middle of a lens.
         """
@@ -86,7 +91,8 @@ class FilmMap:
         corners = torch.cat((torch.zeros_like(pose[:3, :1]), torch.eye(3, dtype=pose.dtype, device=pose.device)), 1)
         at = replace(self._camera, to_world=pose).film_of(corners)
         assert at is not None
-        return at[:, 1:] - at[:, :1], at[:, :1]
+        slope = at[:, 1:] - at[:, :1]
+        return slope, at[:, :1] - slope @ self._camera.origin()
 
     @cached_property
     def _ways(self) -> Tensor:
@@ -109,7 +115,7 @@ class FilmMap:
             assert seen is not None
             return seen
         slope, middle = self._affine
-        return torch.addmm(middle, slope, p - self._camera.origin())
+        return torch.addmm(middle, slope, p)
 
     def places(self, p: Tensor, lens: Tensor | None) -> Tensor:
         """Return places ``(2, N)`` of points ``(3, N)``; any for those behind the camera. ``lens``: as for :meth:`of`."""

@@ -28,7 +28,7 @@ from torchpt.gradients.edges.bodies import Bodies, Held
 from torchpt.gradients.edges.film import Worth, flat_places
 from torchpt.gradients.edges.traced import Passing, Traced
 from torchpt.gradients.edges.vertices import Spot, met
-from torchpt.math.vectors import dot, largest, rows, take
+from torchpt.math.vectors import dot, lanes_of, largest, rows, take
 from torchpt.paths.roulette import russian_roulette, survival_probability
 from torchpt.physics.shapes.interaction import slide_share
 
@@ -69,6 +69,11 @@ class MovingFrame:
     moves: Tensor
     holds_first: bool
     camera_moves: bool
+
+    @property
+    def follows_camera(self) -> bool:
+        """Return True if what the camera sees moves with it."""
+        return self.camera_moves and not self.holds_first
 
     def share(self, prim: Tensor, r: Tensor) -> Tensor:
         """Return the share ``(N,)`` by which points slide at the ends of rays of length ``r (N,)``; 1 where these miss."""
@@ -121,6 +126,7 @@ class Prefix:
         frame: of the interior.
         lane: ``(M,)`` the receivers.
         weight: ``(3, M)`` worth of the light that arrives at them, by area.
+        moves: ``(M,)`` bool: the paths move.
         place: ``(2, M)`` of the paths on the film.
         lens: ``(2, M)`` samples of the lens that they pass; None: there is none.
         chain: vertices behind the camera, first that which it sees, of these paths and others; the last is the receiver.
@@ -130,6 +136,7 @@ class Prefix:
     frame: MovingFrame
     lane: Tensor
     weight: Tensor
+    moves: Tensor
     place: Tensor
     lens: Tensor | None
     chain: tuple[PathVertex, ...]
@@ -147,21 +154,13 @@ class Prefix:
 
     def taken(self, index: Tensor) -> Prefix:
         """Return some of the lanes."""
-        lane, weight, place, lens, columns = rows((self.lane, self.weight, self.place, self.lens, self.columns), index)
-        return Prefix(self.frame, lane, weight, place, lens, self.chain, columns)
-
-    def moves(self, first: int | None = None) -> Tensor:
-        """Return a mask ``(M,)`` of the paths that move; ``first``: by so many vertices only."""
-        if self.frame.camera_moves and not self.frame.holds_first:
-            return torch.ones_like(self.lane, dtype=torch.bool)
-        moving = torch.zeros_like(self.lane, dtype=torch.bool)
-        for vertex, column in zip(self.chain[:first], self.columns, strict=False):
-            moving = moving | self.frame.moving(take(vertex.held.prim, column))
-        return moving
+        own = self.lane, self.weight, self.moves, self.place, self.lens, self.columns
+        lane, weight, moves, place, lens, columns = rows(own, index)
+        return Prefix(self.frame, lane, weight, moves, place, lens, self.chain, columns)
 
     def motion(self) -> Tensor:
         """Return about how far receivers move where all that moves does by 1 ``(M,)``."""
-        how = self.moves(1).double()
+        how = (self.moves if self.frame.follows_camera else self.frame.moving(self.vertices[0].held.prim)).double()
         for before, vertex in pairwise(self.vertices):
             away = vertex.p - before.p
             share = self.frame.share(vertex.held.prim, dot(away, away).sqrt())
@@ -170,7 +169,7 @@ class Prefix:
 
     def pull_back(self, cotangents: Cotangents, cotangent: Tensor) -> None:
         """Add the cotangents of all that moves receivers, by one of where these are in the interior's frame ``(3, M)``."""
-        some = self.moves().nonzero().squeeze(1)
+        some = self.moves.nonzero().squeeze(1)
         if len(some) < len(self.lane):
             if len(some):
                 self.taken(some).pull_back(cotangents, take(cotangent, some))
@@ -224,9 +223,10 @@ def prefixes_of(
     lane = torch.arange(wi.shape[1], device=wi.device)
     carried = torch.ones_like(wi)
     chain, columns = (_vertex(frame, spot),), (lane,)
-    every = moves is None or (frame.camera_moves and not frame.holds_first)
-    counts = torch.ones_like(lane, dtype=torch.bool) if every else moves | frame.moving(spot.hit.prim)
+    every = torch.ones_like(lane, dtype=torch.bool)
+    moving = every if frame.follows_camera else frame.moving(spot.hit.prim)
     for k in range(1, longest + 1):
+        counts = take(every, lane) if moves is None else moving | take(moves, lane)
         index, place, lens, wo = _seen(frame, spot, counts, Passing(take(key, lane), _TO_CAMERA + k))
         if len(index):
             seen = spot.taken(index)
@@ -235,7 +235,8 @@ def prefixes_of(
             sent = seen.sent(wo.to(spot.p), back, own).double()
             area = frame.bodies.film.area(seen.p.double(), seen.n.double(), lens)
             weight = frame.worth.at(place) * sent * take(carried, index) * area
-            prefix = Prefix(frame, take(lane, index), weight, place, lens, chain, rows(columns, index))
+            own = take(lane, index), weight, take(moving, index), place, lens
+            prefix = Prefix(frame, *own, chain, rows(columns, index))
             some = (weight != 0).any(0).nonzero().squeeze(1)
             if len(some):
                 found.append(prefix.taken(some))
@@ -249,16 +250,16 @@ def prefixes_of(
             draws = frame.traced.draws(take(key, lane), k + 1)
             chance = survival_probability(None, 1.0, largest(carried.abs()), None)
             alive, carried = russian_roulette(chance, draws, alive, carried)
-        on = alive.nonzero().squeeze(1)
+        on = lanes_of(alive)
         spot = met(frame.traced, take(o, on), take(d, on), Passing(take(key, take(lane, on)), k + 1))
-        some = (spot.hit.prim >= 0).nonzero().squeeze(1)
-        kept = take(on, some)
-        if not len(kept):
-            break
+        some = lanes_of(spot.hit.prim >= 0)
+        kept = on if some is None else some if on is None else take(on, some)
         lane, carried, spot = take(lane, kept), take(carried, kept), spot.taken(some)
-        counts = take(counts, kept) | frame.moving(spot.hit.prim)
+        if not len(lane):
+            break
+        moving = take(moving, kept) | frame.moving(spot.hit.prim)
         chain = _vertex(frame, spot), *chain
-        columns = torch.arange(len(kept), device=wi.device), *rows(columns, kept)
+        columns = torch.arange(len(lane), device=wi.device), *rows(columns, kept)
         wi = -spot.d.double()
     return found
 

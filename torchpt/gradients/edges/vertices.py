@@ -17,7 +17,7 @@ from torch import Tensor
 from torchpt.gradients.edges.bodies import Bodies, Held
 from torchpt.gradients.edges.traced import Passing, Traced
 from torchpt.math.sampling import uniform_hemisphere
-from torchpt.math.vectors import Frame, cross, dot, rows, take
+from torchpt.math.vectors import Frame, cross, dot, lanes_of, rows, take
 from torchpt.paths.integrators.path import partition
 from torchpt.paths.state import Drawn, Plan
 from torchpt.paths.surface import Surface, surface_at
@@ -54,9 +54,9 @@ class Spot:
     p: Tensor
     n: Tensor
 
-    def taken(self, index: Tensor) -> Spot:
-        """Return some of the lanes."""
-        return Spot(self.traced, *rows((self.o, self.d, self.hit, self.p, self.n), index))
+    def taken(self, index: Tensor | None) -> Spot:
+        """Return some of the lanes; None: all."""
+        return self if index is None else Spot(self.traced, *rows((self.o, self.d, self.hit, self.p, self.n), index))
 
     def held(self, bodies: Bodies) -> Held:
         """Return the points held on their surfaces; any point in lanes that missed."""
@@ -179,11 +179,12 @@ def met(traced: Traced, o: Tensor, d: Tensor, passing: Passing | None = None) ->
         passing: decides which surfaces rays pass by their opacity; its distances are in the lanes' unit of length. None: none.
     """
     world, dtype = traced.wave.context.world, traced.dtype
-    d = (d / (d * d).sum(0).sqrt()).to(dtype)
-    o = o.to(dtype)
+    o, d = o.to(dtype), (d / (d * d).sum(0).sqrt()).to(dtype)
     hit = traced.intersect(o, d, passing)
     hit = Hit(hit.t.to(dtype), hit.prim, hit.u.to(dtype), hit.v.to(dtype))
-    p, n = torch.zeros_like(d), torch.zeros_like(d)
-    some = (hit.prim >= 0).nonzero().squeeze(1)
+    some = lanes_of(hit.prim >= 0)
     at = interact(world, take(o, some), take(d, some), rows(hit, some))
+    if some is None:
+        return Spot(traced, o, d, hit, at.p, at.ng)
+    p, n = torch.zeros_like(d), torch.zeros_like(d)
     return Spot(traced, o, d, hit, p.index_copy(1, some, at.p), n.index_copy(1, some, at.ng))
