@@ -227,7 +227,7 @@ def prefixes_of(
     moving = every if frame.follows_camera else frame.moving(spot.hit.prim)
     for k in range(1, longest + 1):
         counts = take(every, lane) if moves is None else moving | take(moves, lane)
-        index, place, lens, wo = _seen(frame, spot, counts, Passing(take(key, lane), _TO_CAMERA + k))
+        index, place, lens, wo = _seen(frame, spot, counts, Passing(key, _TO_CAMERA + k))
         if len(index):
             seen = spot.taken(index)
             back = take(wi, index).to(spot.p)
@@ -242,19 +242,19 @@ def prefixes_of(
                 found.append(prefix.taken(some))
         if k == longest:
             break
-        o, d, weight = spot.scattered(wi.to(spot.p), take(key, lane), k + 1, side)
+        o, d, weight = spot.scattered(wi.to(spot.p), key, k + 1, side)
         side = None
         carried = carried * weight.double()
         alive = (carried != 0).any(0)
         if k >= _ROULETTE:
-            draws = frame.traced.draws(take(key, lane), k + 1)
+            draws = frame.traced.draws(key, k + 1)
             chance = survival_probability(None, 1.0, largest(carried.abs()), None)
             alive, carried = russian_roulette(chance, draws, alive, carried)
         on = lanes_of(alive)
-        spot = met(frame.traced, take(o, on), take(d, on), Passing(take(key, take(lane, on)), k + 1))
+        spot = met(frame.traced, take(o, on), take(d, on), Passing(take(key, on), k + 1))
         some = lanes_of(spot.hit.prim >= 0)
         kept = on if some is None else some if on is None else take(on, some)
-        lane, carried, spot = take(lane, kept), take(carried, kept), spot.taken(some)
+        spot, (lane, key, carried) = spot.taken(some), rows((lane, key, carried), kept)
         if not len(lane):
             break
         moving = take(moving, kept) | frame.moving(spot.hit.prim)
