@@ -21,8 +21,8 @@ import torch
 from torch import Tensor
 
 from torchpt.core.errors import EdgeWarning, warn_caller
-from torchpt.gradients.edges.cotangents import Cotangents
 from torchpt.gradients.edges.bodies import ROUNDING, Bodies, Held
+from torchpt.gradients.edges.cotangents import Cotangents
 from torchpt.gradients.edges.curves import Curves, circles, corners, joined, known, straight
 from torchpt.gradients.edges.meshes import neighbours_of
 from torchpt.math.vectors import cross, dot, rows, take

@@ -49,7 +49,7 @@ class Worth:
         return total
 
     def _taps(self, s: Tensor) -> list[tuple[Tensor, Tensor, list[bool]]]:
-        """Return pixels that see places, along both axes: ``(2, N)``, the filter there, 0 off the film, and where any is not."""
+        """Return taps of the filter: pixels along both axes ``(2, N)``, weights, 0 off the film, and which axes have others."""
         radius, found = self._filter.radius, []
         low, size = torch.tensor(self._crop, device=s.device)[:, None].split(2)
         begin = s - 0.5 - radius
@@ -138,7 +138,7 @@ class FilmMap:
         return s, torch.stack([(slope[k] - slope[2] * turned[k]) / h for k in range(2)])
 
     def area(self, p: Tensor, n: Tensor, lens: Tensor | None) -> Tensor:
-        """Return the areas ``(N,)`` of the film for one of surfaces at points before the camera, with unit normals ``(3, N)``."""
+        """Return the areas ``(N,)`` of the film for one of surfaces at points before the camera; ``n (3, N)``: unit normals."""
         if lens is None:  # the cross product of both slopes, multiplied out
             x, y, h, _ = self.of(p, None)
             across = self._faces @ n

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchpt.gradients.edges.cotangents import Cotangents
 from torchpt.gradients.edges.bodies import Bodies, Held
+from torchpt.gradients.edges.cotangents import Cotangents
 from torchpt.gradients.edges.curves import smooth_faces
 from torchpt.gradients.edges.receivers import MovingFrame, Prefix, prefixes_of
 from torchpt.gradients.edges.traced import Use

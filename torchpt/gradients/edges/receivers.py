@@ -23,8 +23,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from torchpt.gradients.edges.cotangents import Cotangents
 from torchpt.gradients.edges.bodies import Bodies, Held
+from torchpt.gradients.edges.cotangents import Cotangents
 from torchpt.gradients.edges.film import Worth, flat_places
 from torchpt.gradients.edges.traced import Passing, Traced
 from torchpt.gradients.edges.vertices import Spot, met
@@ -298,7 +298,11 @@ def _seen(
 ) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
     """Return which points the picture sees ``(n,)``, their places on the film and on the lens, and directions to the camera.
 
-    ``counts``: mask ``(N,)`` of the points that are looked at. ``passing``: decides which surfaces between them rays pass by their opacity; its numbers choose points on the lens too.
+    Args:
+        frame: of the interior.
+        spot: the points.
+        counts: mask ``(N,)`` of those that are looked at.
+        passing: decides which surfaces between them rays pass by their opacity; its numbers choose points on the lens too.
     """
     film, x = frame.bodies.film, spot.p.double()
     lens = frame.traced.lens(passing.key, passing.depth)

@@ -29,8 +29,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from torchpt.gradients.edges.cotangents import Cotangents
 from torchpt.gradients.edges.bodies import Bodies, Held
+from torchpt.gradients.edges.cotangents import Cotangents
 from torchpt.gradients.edges.curves import smooth_faces
 from torchpt.gradients.edges.cuts import Crossing, crossing_of
 from torchpt.gradients.edges.occluders import Occluders
@@ -357,7 +357,13 @@ class SegmentSamples:
 
 @dataclass(frozen=True)
 class Motions:
-    """Derivatives by motions along ``m``: of edges ``(N,)``, of the ends on both sides, and of each prefix's receivers ``(M,)``."""
+    """Derivatives by motions along ``m``.
+
+    Attributes:
+        edge: of edges ``(N,)``.
+        ends: of what is seen on both sides ``(N,)``.
+        receivers: of the receivers of each prefix ``(M,)``.
+    """
 
     edge: Tensor
     ends: list[Tensor]

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchpt.gradients.edges.cotangents import Cotangents
 from torchpt.gradients.edges.bodies import Bodies, Held
+from torchpt.gradients.edges.cotangents import Cotangents
 from torchpt.gradients.edges.curves import View
 from torchpt.gradients.edges.occluders import Occluders, OutlinePoints
 from torchpt.gradients.edges.receivers import MovingFrame, Prefix, prefixes_of
