@@ -191,8 +191,8 @@ class Prefix:
         slid = first.n * (dot(d, cotangent) / steep)
         cotangents.add_points(first.held, slid)
         if self.frame.camera_moves:
-            rest = cotangent - slid
-            cotangents.add_rays(self.place, self.lens, rest, rest * (dot(first.n, first.p - o) / steep))
+            rest, away = cotangent - slid, self.frame.bodies.points(first.held) - o
+            cotangents.add_rays(self.place, self.lens, rest, rest * (dot(first.n, away) / steep))
 
 
 def prefixes_of(
