@@ -175,7 +175,8 @@ class Traced:
         ``passing``: as for :meth:`nearest`.
         """
         if passing is not None and self.has_opacity:
-            return self.nearest(o, d, passing)[0] <= far
+            t, prim = self.nearest(o, d, passing)
+            return (prim >= 0) & (t < far)
         return self.wave.accel.occluded(o, d, far.float())
 
     def intersect(self, o: Tensor, d: Tensor, passing: Passing | None = None) -> Hit:
