@@ -383,9 +383,9 @@ FAULTS = (
         "receivers_stand_still",
         "gradients/edges/receivers.py",
         "edges render",
-        "Prefix.receivers",
-        "at + (slid - at) * self.frame.share(vertex.held.prim, r)",
-        "at",
+        "Prefix.pull_back",
+        "self.frame.share(vertex.held.prim, dot(away, away).sqrt())",
+        "0.0",
         "edges in indirect light count as if all points were held, against an interior in which near ones slide",
     ),
     # -- search

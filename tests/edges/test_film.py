@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import torchpt
-from torchpt.gradients.edges.film import Worth, film_places, slopes
+from torchpt.gradients.edges.film import FilmMap, Worth
 from torchpt.physics.cameras import Camera
 from torchpt.scene.formats.description import settings
 
@@ -46,9 +46,12 @@ def test_points_of_rays_lie_where_the_rays_do(name: str) -> None:
     lens = lens_of(camera)
     o, d = camera.rays(s[0], s[1], lens)
     far = torch.rand(50, generator=generator, dtype=torch.float64) + 0.1
-    torch.testing.assert_close(film_places(camera, o + d * far, lens), s, rtol=0, atol=1e-5)  # axes are float32
-    behind = camera.film_of(o - d * far, lens)
-    assert behind is not None and bool((torch.minimum(behind[2], behind[3]) < 0).all())
+    film = FilmMap(camera)
+    torch.testing.assert_close(film.places(o + d * far, lens), s, rtol=0, atol=1e-5)  # axes are float32
+    torch.testing.assert_close(film.rays(s, lens), (o, d), rtol=0, atol=1e-7)
+    behind = film.of(o - d * far, lens)
+    torch.testing.assert_close(behind, camera.film_of(o - d * far, lens))
+    assert bool((torch.minimum(behind[2], behind[3]) < 0).all())
 
 
 @pytest.mark.parametrize("filter", ["box", "tent", "gaussian", "mitchell"])
@@ -82,10 +85,15 @@ def test_slopes_are_derivatives_of_places(name: str) -> None:
     made = scene.camera(settings(scene.description).film, scene.params, torch.float64)
     p = 2 * torch.randn(3, 50, generator=torch.Generator().manual_seed(1), dtype=torch.float64)  # some behind
     lens = lens_of(made)
-    s, found = slopes(made, p, lens)
-    expected = torch.autograd.functional.jacobian(lambda q: film_places(made, q, lens).sum(1), p)
-    torch.testing.assert_close(s, film_places(made, p, lens))
+    film = FilmMap(made)
+    s, found = film.slopes(p, lens)
+    expected = torch.autograd.functional.jacobian(lambda q: film.places(q, lens).sum(1), p)
+    torch.testing.assert_close(s, film.places(p, lens))
     torch.testing.assert_close(found, expected)
+    n = torch.randn(3, 50, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    front = film.of(p, lens)[2] > 0
+    area = (torch.linalg.cross(found[0], found[1], dim=0) * n).sum(0).abs()
+    torch.testing.assert_close(film.area(p, n, lens)[front], area[front])
 
 
 @pytest.mark.parametrize("light", [[0.0, 0.0, 1.0], [1.0, 0.0, 1.0]])

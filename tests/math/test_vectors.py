@@ -9,7 +9,7 @@ import torch
 from trials import SIGNIFICANCE, chi_square_p
 
 from torchpt.math.sampling import Distribution1D, power_heuristic, uniform_sphere
-from torchpt.math.vectors import Frame, cross, dot, inverse_square, luminance, normalize, take
+from torchpt.math.vectors import Frame, cross, dot, inverse_square, lanes_of, luminance, normalize, take
 
 G = torch.Generator().manual_seed(4)
 AXES = torch.cat((torch.eye(3), -torch.eye(3)), 1)
@@ -72,6 +72,9 @@ def test_luminance_and_take():
     index = torch.tensor([3, 0, 3])
     assert torch.equal(take(table, index), table[:, index])
     assert torch.equal(take(table[0], index), table[0, index])
+    mask = table[0] > table[0].mean()
+    assert torch.equal(take(table, lanes_of(mask)), table[:, mask])
+    assert lanes_of(mask | ~mask) is None and take(table, None) is table
 
 
 SCALES = torch.tensor([0.0, 1e-36, 1e-30, 1e-19, 1e-10, 1.0, 1e10, 1.8e19, 1e30, 3e38])

@@ -18,7 +18,7 @@ import torchpt
 from torchpt.core.errors import RenderError, SceneError
 from torchpt.engines.kernels.engine import Chunk, KernelsEngine
 from torchpt.engines.kernels.programs import Kernels
-from torchpt.gradients.edges.traced import Along
+from torchpt.gradients.edges.traced import Along, Passing, Use, traced_of
 from torchpt.paths.wave import Rays
 from torchpt.physics.bsdfs.kinds.diffuse import Diffuse
 from torchpt.rendering import kernels_of, make_wave
@@ -392,6 +392,27 @@ def test_rays_by_numbers(compile, accel):
     assert torch.equal(own[:, 2], found[:, 3])
     eager = Along(scene, replace(wish, render=wish.render.but(compile="off")), wave)
     assert torch.allclose(eager.radiance(wave.with_rays(Rays(o, d, number)), 1), found, atol=1e-5)
+    along = Along(scene, wish, wave)
+    for depth in (5, 1, 3):  # kernels are found once for all lengths of paths
+        shorter = replace(wave.with_rays(Rays(o, d, number)), integrator=wave.integrator.to_depth(depth))
+        assert torch.equal(along.radiance(shorter, 1), Along(scene, wish, wave).radiance(shorter, 1))
+
+
+@pytest.mark.parametrize("opacity", [None, 0.5])
+def test_blocked_rays_meet_something_before(opacity):
+    """As :meth:`Traced.nearest` says, also where surfaces let some of the rays pass."""
+    material = {"type": "diffuse"} if opacity is None else {"type": "diffuse", "opacity": opacity}
+    shapes = {"ball": {"type": "sphere", "material": material}}
+    scene = torchpt.load({"camera": {"origin": [0, 0, 5], "target": [0, 0, 0]}, "shapes": shapes}, device="cpu")
+    traced = traced_of(scene, settings(scene.description, {}), {}, torch.float32)
+    g = torch.Generator().manual_seed(5)
+    d = torch.randn(3, 400, generator=g, dtype=torch.float64)
+    o = 4.0 * torch.randn(3, 400, generator=g, dtype=torch.float64)
+    far = torch.rand(400, generator=g, dtype=torch.float64) * 6.0
+    passing = Passing(traced.key(torch.arange(400), Use.BEHIND), depth=1)
+    blocked = traced.blocked(o, d - o, far, passing)
+    assert torch.equal(blocked, traced.nearest(o, d - o, passing)[0] < far)
+    assert 0 < int(blocked.sum()) < 400
 
 
 @quiet

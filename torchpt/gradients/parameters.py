@@ -128,14 +128,14 @@ def _half_diagonal(boxes: Iterable[Tensor]) -> Tensor:
 def _boxes(scene: Scene, geometry: LaneGeometry) -> dict[str, Tensor]:
     """Return boxes ``(2, 3)`` around the parts and instances by name: least and greatest coordinates, about."""
     p0, e1, e2 = (corner.double() for corner in (geometry.p0, geometry.e1, geometry.e2))
-    fourth = p0 + e1 + e2
-    triangles = slice(0, geometry.counts[0])
-    fourth[:, triangles] = p0[:, triangles]
-    corners = torch.stack((p0, p0 + e1, p0 + e2, fourth))
-    low, high = corners.amin(0), corners.amax(0)
+    low, high = torch.minimum(e1, e2).clamp_max(0.0), torch.maximum(e1, e2).clamp_min(0.0)
+    four = slice(geometry.counts[0], sum(geometry.counts[:2]))
+    fourth = e1[:, four] + e2[:, four]
+    low[:, four], high[:, four] = torch.minimum(low[:, four], fourth), torch.maximum(high[:, four], fourth)
     round_ = slice(sum(geometry.counts[:2]), None)  # disks, spheres and quadrics are about p0
-    radius = torch.maximum(e1.norm(dim=0), e2.norm(dim=0))[round_]
-    low[:, round_], high[:, round_] = p0[:, round_] - radius, p0[:, round_] + radius
+    radius = torch.maximum(e1[:, round_].norm(dim=0), e2[:, round_].norm(dim=0))
+    low[:, round_], high[:, round_] = -radius, radius
+    low, high = p0 + low, p0 + high
     boxes: dict[str, Tensor] = {}
     first = 0
     for part in scene.built.parts:

@@ -21,6 +21,7 @@ __all__ = [
     "cross",
     "dot",
     "inverse_square",
+    "lanes_of",
     "largest",
     "luminance",
     "normalize",
@@ -105,7 +106,7 @@ def take(table: Tensor, index: Tensor | None) -> Tensor:
         taken = gathers.take(table, index)
         if taken is not None:
             return taken
-    if table.dim() == 2 and len(index) >= _MANY and table.dtype is not torch.float32 and table.is_cpu:
+    if table.dtype is not torch.float32 and table.dim() == 2 and index.shape[0] >= _MANY and table.is_cpu:
         # torch's index_select is vectorized for float32 alone.
         return torch.gather(table, 1, index.long().expand(len(table), -1))
     return torch.index_select(table, table.dim() - 1, index)
@@ -121,6 +122,12 @@ def side_by_side(table: Tensor) -> Tensor:
 
 
 T = TypeVar("T")
+
+
+def lanes_of(mask: Tensor) -> Tensor | None:
+    """Return the lanes ``(n,)`` where a mask is True; None, which :func:`take` knows as all of them, where it is everywhere."""
+    index = mask.nonzero().squeeze(1)
+    return None if index.shape[0] == mask.shape[0] else index
 
 
 def rows(record: T, index: Tensor | None) -> T:

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from copy import copy
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -369,6 +370,12 @@ class Kernels(Layout):
         self._seconds = 0.0
         self.eager: dict[int, str] = {}
         self.light_paths: Kernels | None = None
+
+    def with_rays(self, wave: Wave) -> Kernels:
+        """Return these kernels for a wave that differs in the rays that paths start with, and in the limits of paths."""
+        kernels = copy(self)
+        kernels.wave = wave
+        return kernels
 
     def _use(self, caches: KernelCaches) -> None:
         """Use the caches of a scene, once the structure is known."""

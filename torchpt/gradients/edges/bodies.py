@@ -9,13 +9,14 @@ line of sight there, so that its points and the outline have the same motion acr
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import torch
 from torch import Tensor
 
+from torchpt.gradients.edges.film import FilmMap
 from torchpt.math.vectors import affine, cross, dot, normalize, take
 from torchpt.math.vectors import rows as columns
 from torchpt.physics.cameras import Camera
@@ -75,6 +76,21 @@ class Bodies:
         """Return the id of the first quadric."""
         return sum(self.counts[:4])
 
+    @cached_property
+    def film(self) -> FilmMap:
+        """Return where the camera sees points."""
+        return FilmMap(self.camera)
+
+    @cached_property
+    def _flat(self) -> Tensor:
+        """Return origins and two axes ``(9, P)`` in one table, as one look-up is faster than three."""
+        return torch.cat((self.p0, self.e1, self.e2))
+
+    @cached_property
+    def _sizes(self) -> Tensor:
+        """Return :meth:`sizes` of all primitives but for copies."""
+        return _size(*self.place(torch.arange(self.p0.shape[1], device=self.p0.device)))
+
     def place(self, prim: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return origin and three axes ``(3, N)`` each of primitives ``(N,)``; the third of flat ones is zero."""
         table = None
@@ -82,7 +98,7 @@ class Bodies:
             column = torch.searchsorted(self.copies.start[1:], prim, right=True)
             table = columns(self.copies, column)
             prim = prim - table.start + table.first
-        p0, x, y = (take(t, prim) for t in (self.p0, self.e1, self.e2))
+        p0, x, y = take(self._flat, prim).view(3, 3, -1)
         z = torch.zeros_like(p0)
         if self.counts[4]:
             mine = prim >= self.first_quadric
@@ -95,6 +111,10 @@ class Bodies:
             p0, x, y = _moved(table, p0) + table.move, _moved(table, x), _moved(table, y)
         return p0, x, y, z
 
+    def sizes(self, prim: Tensor) -> Tensor:
+        """Return sums ``(3, N)`` of the absolute coordinates of origin and axes of primitives ``(N,)``."""
+        return take(self._sizes, prim) if self.copies is None else _size(*self.place(prim))
+
     def corners(self, prim: Tensor) -> list[Tensor]:
         """Return the four corners ``(3, N)`` of triangles and parallelograms; the last of a triangle is its first."""
         four = (prim >= self.counts[0]) & (prim < sum(self.counts[:2]))
@@ -104,30 +124,36 @@ class Bodies:
     def boxes(self, prim: Tensor) -> tuple[Tensor, Tensor]:
         """Return lower and upper corners ``(3, N)`` of boxes about primitives ``(N,)``."""
         p0, x, y, z = self.place(prim)
-        zero = torch.zeros_like(p0)
+        low, high = torch.minimum(x, y).clamp_max(0.0), torch.maximum(x, y).clamp_min(0.0)
         triangle = self.is_triangle(prim)
         four = ~triangle & (prim < sum(self.counts[:2]))
-        corners = torch.stack((zero, x, y, torch.where(four, x + y, zero)))
-        low, high = corners.amin(0), corners.amax(0)
-        ring = (x * x + y * y).sqrt()
-        ball = (x * x + y * y + z * z).sqrt()
-        tall = ~self.is_flat(prim) & torch.isfinite(self.forms_of(prim)[3])
-        for mask, reach, up in ((~triangle & ~four, ball, zero), (tall, ring, z)):
-            low = torch.where(mask, -reach + torch.minimum(up, zero), low)
-            high = torch.where(mask, reach + torch.maximum(up, zero), high)
+        if self.counts[1]:
+            fourth = torch.where(four, x + y, 0.0)
+            low, high = torch.minimum(low, fourth), torch.maximum(high, fourth)
+        if any(self.counts[2:]):
+            zero = torch.zeros_like(p0)
+            ring = (x * x + y * y).sqrt()
+            ball = (x * x + y * y + z * z).sqrt()
+            tall = ~self.is_flat(prim) & torch.isfinite(self.forms_of(prim)[3])
+            for mask, reach, up in ((~triangle & ~four, ball, zero), (tall, ring, z)):
+                low = torch.where(mask, -reach + torch.minimum(up, zero), low)
+                high = torch.where(mask, reach + torch.maximum(up, zero), high)
         return p0 + low, p0 + high
 
     def rounding(self, along: Tensor, *prims: Tensor) -> Tensor:
         """Return by how much rounding moves primitives ``(N,)`` along directions ``(3, N)``; little along an axis near 0."""
-        size = torch.zeros_like(along)
-        for prim in prims:
-            size = size + torch.stack([t.abs() for t in self.place(prim)]).sum(0)
+        size = sum(map(self.sizes, prims), torch.zeros(1, 1, dtype=along.dtype, device=along.device))
         return dot(along.abs(), size) * ROUNDING
 
     def points(self, held: Held) -> Tensor:
         """Return where points are ``(3, N)``."""
-        p0, x, y, z = self.place(held.prim)
-        return affine(p0 + x * held.a[0], y, held.a[1], z, held.a[2])
+        p0, *axes = self.place(held.prim)
+        return p0 + self.vectors(axes, held.a)
+
+    def vectors(self, axes: Sequence[Tensor], a: Tensor) -> Tensor:
+        """Return vectors ``(3, N)`` of numbers ``a (3, N)`` along the axes of :meth:`place`."""
+        flat = torch.addcmul(axes[0] * a[0], axes[1], a[1])
+        return torch.addcmul(flat, axes[2], a[2]) if self.counts[3] or self.counts[4] else flat
 
     def own(self, prim: Tensor, p: Tensor) -> Tensor:
         """Return the numbers ``(3, N)`` of points ``p (3, N)`` of primitives."""
@@ -182,6 +208,10 @@ class Bodies:
         own = {name: tensors[name] for name in ("p0", "e1", "e2", "e3", "lights")}
         copies = None if self.copies is None else replace(self.copies, **of("copies."))
         return replace(self, **own, copies=copies, camera=replace(self.camera, **of("camera.")))
+
+
+def _size(p0: Tensor, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+    return p0.abs() + x.abs() + y.abs() + z.abs()
 
 
 def _moved(table: Instances, w: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -89,6 +90,8 @@ class Curves:
 
     def at(self, t: Tensor) -> tuple[Held, Tensor]:
         """Return points at ``t (N,)``, and how their numbers change with it ``(3, N)``."""
+        if not bool(self.round.any()):
+            return Held(self.prim, torch.addcmul(self.a, t, self.b)), self.b
         cos, sin = torch.cos(t), torch.sin(t)
         bent, slope = self.a + cos * self.b + sin * self.c, cos * self.c - sin * self.b
         a = torch.where(self.round, bent, self.a + t * self.b)
@@ -97,9 +100,8 @@ class Curves:
     def moving(self, bodies: Bodies, t: Tensor) -> tuple[Held, Tensor, Tensor]:
         """Return points at ``t (N,)``: held, where they are ``(3, N)``, and how that changes with ``t`` ``(3, N)``."""
         held, slope = self.at(t)
-        p0, x, y, z = bodies.place(held.prim)
-        along = x * slope[0] + y * slope[1] + z * slope[2]
-        return held, p0 + x * held.a[0] + y * held.a[1] + z * held.a[2], along
+        p0, *axes = bodies.place(held.prim)
+        return held, p0 + bodies.vectors(axes, held.a), bodies.vectors(axes, slope)
 
 
 def joined(parts: list[Curves]) -> Curves:
@@ -130,12 +132,12 @@ def corners(corner: Tensor, turned: bool = False) -> Tensor:
     return take(table.contiguous(), corner)
 
 
-def mesh_edges(edges: Edges, index: Tensor, first: int, turned: bool) -> tuple[Curves, tuple[Held, Held]]:
+def mesh_edges(edges: Edges, index: Tensor | None, first: int, turned: bool) -> tuple[Curves, tuple[Held, Held]]:
     """Return some edges of a mesh, and the corners of both faces that lie off them.
 
     Args:
         edges: of the mesh.
-        index: which ``(N,)``.
+        index: which ``(N,)``; None: all.
         first: id of the mesh's, or copy's, first triangle.
         turned: whether its triangles have their last two corners exchanged.
     """
@@ -277,9 +279,11 @@ def folds_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor], moves: Tens
     """Yield the edges of each mesh, and of each copy; arguments: see :func:`torchpt.gradients.edges.meshes.meshes_of`."""
     for mesh in meshes_of(scene, bodies, poses, moves):
         edges, part = mesh.edges, mesh.part
-        every = torch.arange(len(edges.border), device=scene.device)
-        curves, others = mesh_edges(edges, every, mesh.first, mesh.turned)
-        normals = (_normal(bodies, others[0].prim), _normal(bodies, others[1].prim))
+        curves, others = mesh_edges(edges, None, mesh.first, mesh.turned)
+        faces = torch.arange(mesh.first, mesh.first + part.primitive_count, device=scene.device)
+        one, two = edges.face
+        of_face = _normal(bodies, faces)
+        normals = take(of_face, one), take(of_face, two)
         apart = normals[0] - normals[1]
         bend = dot(apart, apart).sqrt()
         bend = torch.where(bend > _FLAT, bend, 0.0)
@@ -347,8 +351,10 @@ def parts_of(bodies: Bodies, curves: Curves) -> Tensor:
         code = (
             cells[:, 0] * _MIX[0] + cells[:, 1] * _MIX[1] + cells[:, 2] * _MIX[2]
         )  # (2, N), a point each; it may overflow
-        low, high = code.sort(0).values
-        pair = low + high * _MIX[2]
+        pair = torch.minimum(*code) + torch.maximum(*code) * _MIX[2]
+        in_order = np.sort(pair.cpu().numpy())  # several times faster than torch's
+        if (in_order[1:] != in_order[:-1]).all():
+            continue
         _, group, count = torch.unique(pair, return_inverse=True, return_counts=True)
         parts = torch.minimum(parts, 1.0 / take(count.double(), group))
     length = (ends[1] - ends[0]).square().sum(0).sqrt()

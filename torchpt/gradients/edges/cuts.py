@@ -22,6 +22,7 @@ from torch import Tensor
 
 from torchpt.core.errors import EdgeWarning, warn_caller
 from torchpt.gradients.edges.bodies import ROUNDING, Bodies, Held
+from torchpt.gradients.edges.cotangents import Cotangents
 from torchpt.gradients.edges.curves import Curves, circles, corners, joined, known, straight
 from torchpt.gradients.edges.meshes import neighbours_of
 from torchpt.math.vectors import cross, dot, rows, take
@@ -55,12 +56,14 @@ class Crossing:
 
     Attributes:
         lane: ``(K,)`` of the points.
-        other: the same points held on the other surface.
+        own: the points.
+        other: the same held on the other surface.
         across: unit normals of that ``(3, K)``.
         shift: ``(3, K)`` how points move in their own surface for a motion of 1 along ``across``.
     """
 
     lane: Tensor
+    own: Held
     other: Held
     across: Tensor
     shift: Tensor
@@ -69,6 +72,12 @@ class Crossing:
         """Return points ``p (3, N)``, held on their own surfaces, where the cuts are; differentiable in ``bodies``."""
         apart = dot(self.across, bodies.points(self.other) - take(p, self.lane))
         return p.index_add(1, self.lane, self.shift * apart)
+
+    def pull_back(self, cotangents: Cotangents, cotangent: Tensor) -> None:
+        """Add what a cotangent ``(3, N)`` of :meth:`moved` points asks, beside itself of the points on their own surfaces."""
+        apart = dot(self.shift, take(cotangent, self.lane))
+        cotangents.add_points(self.other, self.across * apart)
+        cotangents.add_points(self.own, self.across * -apart)
 
 
 def crossing_of(bodies: Bodies, cut: Tensor, held: Held, mate: Tensor) -> Crossing | None:
@@ -87,7 +96,7 @@ def crossing_of(bodies: Bodies, cut: Tensor, held: Held, mate: Tensor) -> Crossi
     on_other = Held(other, bodies.own(other, bodies.points(own)))
     n, across = bodies.normals(own), bodies.normals(on_other)
     u = cross(cross(n, across), n)
-    return Crossing(lane, on_other, across, u / dot(across, u))
+    return Crossing(lane, own, on_other, across, u / dot(across, u))
 
 
 # ---- Where surfaces cut

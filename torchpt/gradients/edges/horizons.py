@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from torchpt.gradients.edges.bodies import Bodies, Held
+from torchpt.gradients.edges.cotangents import Cotangents
 from torchpt.gradients.edges.curves import smooth_faces
 from torchpt.gradients.edges.receivers import MovingFrame, Prefix, prefixes_of
 from torchpt.gradients.edges.traced import Use
@@ -40,6 +41,7 @@ class HorizonSamples:
     """Samples of horizons; the derivative of the loss is that of :meth:`sum`.
 
     Attributes:
+        frame: of the interior.
         face: the points on faces.
         n: geometric normals on the side that counts ``(3, N)``.
         omega: directions in their planes ``(3, N)``.
@@ -49,6 +51,7 @@ class HorizonSamples:
         prefixes: of the faces' points, each with the light ``(M,)``.
     """
 
+    frame: MovingFrame
     face: Held
     n: Tensor
     omega: Tensor
@@ -59,16 +62,18 @@ class HorizonSamples:
 
     def sum(self, bodies: Bodies) -> Tensor:
         """Return a number, differentiable in ``bodies``; of no meaning but for its derivative."""
+        cotangents, opens, ends = Cotangents(self.frame.moves), torch.zeros_like(self.r), torch.zeros_like(self.r)
+        turns = (1.0 - self.share) / self.r
+        for prefix, light in self.prefixes:
+            turned = take(turns, prefix.lane) * light
+            opens.index_add_(0, prefix.lane, light)
+            ends.index_add_(0, prefix.lane, turned)
+            prefix.pull_back(cotangents, take(self.n, prefix.lane) * -turned)
+        cotangents.add_points(self.seen, self.n * ends)
         _, x, y, _ = bodies.place(self.face.prim)
         n = normalize(cross(x, y))
-        opens = dot(n * torch.sign(dot(n.detach(), self.n)), self.omega)
-        end = dot(self.n, bodies.points(self.seen))
-        value = torch.zeros((), dtype=n.dtype, device=n.device)
-        for prefix, light in self.prefixes:
-            lane = prefix.lane
-            turns = (take(end, lane) - dot(take(self.n, lane), prefix.receivers(bodies))) / take(self.r, lane)
-            value = value + ((take(opens, lane) + (1.0 - take(self.share, lane)) * turns) * light).sum()
-        return value
+        turning = dot(n * torch.sign(dot(n.detach(), self.n)), self.omega)
+        return (turning * opens).sum() + cotangents.sum(bodies)
 
 
 @dataclass(frozen=True)
@@ -130,7 +135,7 @@ class Horizons:
                 brought.index_add_(0, prefix.lane, light.abs())
             turn.record(drawn, scale, brought)
         seen, share = y.held(bodies), self.frame.share(y.hit.prim, r)
-        return HorizonSamples(face, n, omega, seen, r, share, prefixes) if prefixes else None
+        return HorizonSamples(self.frame, face, n, omega, seen, r, share, prefixes) if prefixes else None
 
     def _spot(self, prim: Tensor, uv: Tensor, x: Tensor, omega: Tensor) -> Spot:
         """Return the points of faces as what rays met."""

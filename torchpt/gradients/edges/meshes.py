@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -44,6 +45,16 @@ class Edges:
     other: Tensor
     border: Tensor
     split: Tensor
+
+    @cached_property
+    def behind(self) -> Tensor:
+        """Return the faces ``(3, F)`` behind the edges of faces, each at the corner off it; -1: none."""
+        found = torch.full((3, int(self.face.max()) + 1), -1, dtype=torch.int64, device=self.face.device)
+        inner = (~self.border).nonzero().squeeze(1)
+        face, other = self.face[:, inner], self.other[:, inner]
+        for k in (0, 1):
+            found[other[k], face[k]] = face[1 - k]
+        return found
 
     def of_face(self, k: int) -> Edges:
         """Return the same edges by the corners of face ``k`` alone, 0 or 1."""
@@ -180,10 +191,6 @@ def neighbours_of(scene: Scene, bodies: Bodies, poses: dict[str, Tensor]) -> Ten
     total = sum(bodies.counts) + sum(counts[copy.of] for copy in scene.built.copies)
     found = torch.full((3, total), -1, dtype=torch.int64, device=scene.device)
     for mesh in meshes_of(scene, bodies, poses):
-        edges = mesh.edges
-        inner = (~edges.border).nonzero().squeeze(1)
-        swap = torch.tensor((0, 2, 1) if mesh.turned else (0, 1, 2), device=scene.device)
-        for k in (0, 1):
-            face, corner = edges.face[:, inner] + mesh.first, swap[edges.other[k, inner]]
-            found[corner, face[k]] = face[1 - k]
+        behind = mesh.edges.behind[[0, 2, 1]] if mesh.turned else mesh.edges.behind
+        found[:, mesh.first : mesh.first + behind.shape[1]] = torch.where(behind >= 0, behind + mesh.first, -1)
     return found

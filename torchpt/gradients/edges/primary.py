@@ -24,7 +24,7 @@ from torchpt.gradients.edges.curves import (
     seams_of,
 )
 from torchpt.gradients.edges.cuts import Crossing, Cuts, crossing_of
-from torchpt.gradients.edges.film import Worth, film_places, slopes
+from torchpt.gradients.edges.film import Worth, flat_places
 from torchpt.gradients.edges.meshes import marked_primitives
 from torchpt.gradients.edges.occluders import EdgePoints, Occluders, occluders_of
 from torchpt.gradients.edges.traced import Passing, Traced, Use
@@ -61,8 +61,8 @@ _SHARE, _LEAST = 0.25, 2.0**-6
 def step_of(bodies: Bodies) -> float:
     """Return a whole step, in pixels: a few hundred roundings of a ray's direction."""
     width = float(max(bodies.camera.resolution))
-    spread = float(bodies.camera.pixel()[4]) * width  # of the film at distance 1
-    narrow = max(1.0, 1.0 / spread) if float(bodies.camera.pixel()[3]) else 1.0
+    *_, place, side = bodies.camera.pixel().tolist()
+    narrow = max(1.0, 1.0 / (side * width)) if place else 1.0  # by the film at distance 1
     return _STEP * width * narrow
 
 
@@ -80,17 +80,24 @@ def steps_at(bodies: Bodies, faces: tuple[Tensor, Tensor], s: Tensor, lens: Tens
     for prim in faces:
         some = is_flat(bodies, prim).nonzero().squeeze(1)
         if len(some):
-            corners = outline_of(bodies, prim[some], rows(lens, some))
-            away = torch.stack([distance_to(s[:, some], a, b) for a, b in corners])
-            # The nearest is the edge itself.
-            room[some] = torch.minimum(room[some], away.sort(0).values[1])
+            nearest, *others = distance_to(take(s, some), *outline_of(bodies, take(prim, some), rows(lens, some)))
+            second = take(room, some)
+            for away in others:
+                second = torch.minimum(second, torch.maximum(nearest, away))
+                nearest = torch.minimum(nearest, away)
+            room[some] = second  # the nearest is the edge itself
     return (_SHARE * room).clamp(_LEAST * whole, whole)
 
 
-def outline_of(bodies: Bodies, prim: Tensor, lens: Tensor | None) -> list[tuple[Tensor, Tensor]]:
-    """Return the sides of parallelograms ``(N,)`` on the film, from and to ``(2, N)``; a triangle's last has no length."""
-    places = [film_places(bodies.camera, corner, lens) for corner in bodies.corners(prim)]
-    return list(zip(places, [*places[1:], places[0]], strict=True))
+def outline_of(bodies: Bodies, prim: Tensor, lens: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Return from and to where the sides of triangles and parallelograms ``(N,)`` run on the film, ``(2, sides, N)``.
+
+    There are three sides where the scene has triangles alone; else a triangle has a fourth one of no length.
+    """
+    corners = bodies.corners(prim)[: 4 if bodies.counts[1] else 3]
+    lens = None if lens is None else lens.repeat(1, len(corners))
+    places = bodies.film.places(torch.cat(corners, 1), lens).view(2, len(corners), -1)
+    return places, places.roll(-1, 1)
 
 
 def is_flat(bodies: Bodies, prim: Tensor) -> Tensor:
@@ -99,12 +106,13 @@ def is_flat(bodies: Bodies, prim: Tensor) -> Tensor:
 
 
 def distance_to(s: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """Return distances ``(N,)`` of places ``(2, N)`` from segments ``a b``."""
-    along = b - a
-    square = (along * along).sum(0)
-    share = (((s - a) * along).sum(0) / torch.where(square > 0, square, 1.0)).clamp(0.0, 1.0)
-    away = s - a - along * share
-    return (away * away).sum(0).sqrt()
+    """Return distances ``(sides, N)`` of places ``(2, N)`` from segments between ``a`` and ``b (2, sides, N)``."""
+    x, y = b - a
+    u, v = s[:, None] - a
+    square = torch.addcmul(x * x, y, y)
+    share = (torch.addcmul(u * x, v, y) / torch.where(square > 0, square, 1.0)).clamp(0.0, 1.0)
+    u, v = u - x * share, v - y * share
+    return torch.addcmul(u * u, v, v).sqrt()
 
 
 # ---- Edges of several surfaces that lie on one another, as where two walls of a room meet: each counts in part
@@ -135,7 +143,7 @@ def share_of(
     safe = torch.where(flat, other, 0)
     if not bool(flat.any()):
         return torch.ones_like(step)
-    away = torch.stack([distance_to(s, a, b) for a, b in outline_of(bodies, safe, lens)]).amin(0)
+    away = distance_to(s, *outline_of(bodies, safe, lens)).amin(0)
     return torch.where(flat & (away < 0.5 * step), 0.5, 1.0)
 
 
@@ -244,9 +252,7 @@ def _lines(bodies: Bodies, curves: Curves, importance: Tensor, bounds: Bounds) -
     ends = []
     for t in (low, high):
         _, p, _ = curves.moving(bodies, t)
-        seen = bodies.camera.film_of(p)
-        assert seen is not None
-        ends.append(seen)
+        ends.append(bodies.film.of(p, None))
     begin, end = ends
     x0, x1, y0, y1 = bounds
 
@@ -281,15 +287,13 @@ def _arcs(bodies: Bodies, curves: Curves, importance: Tensor, bounds: Bounds) ->
     step = (whole.high - whole.low) / _CUTS
     low = whole.low + torch.arange(_CUTS, dtype=torch.float64, device=some.device).repeat(len(some)) * step
     cut = whole.within(low, low + step)
-    ends = [bodies.camera.film_of(cut.moving(bodies, t)[1]) for t in (cut.low, cut.high)]
-    first, last = ends
-    assert first is not None and last is not None
+    first, last = (bodies.film.of(cut.moving(bodies, t)[1], None) for t in (cut.low, cut.high))
     x0, x1, y0, y1 = bounds
     across = math.hypot(x1 - x0, y1 - y0)
     front = (torch.minimum(first[2], last[2]) > 0) & (torch.minimum(first[3], last[3]) > 0)
     behind = (torch.maximum(first[2], last[2]) <= 0) | (torch.maximum(first[3], last[3]) <= 0)
     length = torch.where(front, _apart(first, last), across)
-    a, b = (film_places(bodies.camera, cut.moving(bodies, t)[1], None) for t in (cut.low, cut.high))
+    a, b = flat_places(first), flat_places(last)
     near = torch.minimum(a, b) - length, torch.maximum(a, b) + length  # no arc leaves its chord by more than that
     outside = (near[0][0] > x1) | (near[1][0] < x0) | (near[0][1] > y1) | (near[1][1] < y0)
     weight = torch.where(behind | (front & outside), 0.0, length.clamp_max(across)) * take(importance, many)
@@ -336,13 +340,13 @@ class Along:
         """Return a number, differentiable in ``bodies``; of no meaning but for its derivative."""
         p = bodies.points(self.held)
         p = p if self.crossing is None else self.crossing.moved(bodies, p)
-        total = (film_places(bodies.camera, p, self.lens) * self.weight).sum()
+        total = (bodies.film.places(p, self.lens) * self.weight).sum()
         if self.beside is None:
             return total
         origin, away, weight = self.beside
         # What is infinitely far moves along with the camera.
         at = torch.where(torch.isfinite(origin), origin, bodies.camera.origin()) + away
-        return total - (film_places(bodies.camera, at, None) * weight).sum()  # no camera with a lens holds anything
+        return total - (bodies.film.places(at, None) * weight).sum()  # no camera with a lens holds anything
 
 
 @dataclass(frozen=True)
@@ -393,8 +397,7 @@ class SeenThroughLens:
         camera = self.occluders.bodies.camera
         o, _ = camera.rays(torch.zeros_like(u), torch.zeros_like(u), lens)
         drawn = self.occluders.points(self.choice, u, coin, View(o, torch.ones_like(u)))
-        seen = camera.film_of(drawn.p, rows(lens, drawn.lane))
-        assert seen is not None
+        seen = self.occluders.bodies.film.of(drawn.p, rows(lens, drawn.lane))
         return rows(drawn, (seen[2] > 0).nonzero().squeeze(1))
 
 
@@ -424,7 +427,7 @@ class Primary:
         lens = self.traced.lens(key)
         place = self.source.draw(u, coin, lens)
         lens = rows(lens, place.lane)
-        s, jacobian = slopes(self.bodies.camera, place.p, lens)
+        s, jacobian = self.bodies.film.slopes(place.p, lens)
         slope = (jacobian * place.along).sum(1)
         normal = torch.stack((slope[1], -slope[0]))  # as long as `s` changes with the curve's parameter
         length, value = (normal * normal).sum(0).sqrt(), worth.at(s)
@@ -466,7 +469,7 @@ class Primary:
         """Return rays through the film a step beside places, before their curves' normals and behind: ``(3, 2 N)``."""
         places = torch.cat((s - unit * step, s + unit * step), 1)
         lens = None if lens is None else lens.repeat(1, 2)
-        o, d = self.bodies.camera.rays(places[0], places[1], lens)
+        o, d = self.bodies.film.rays(places, lens)
         return o.expand_as(d), d
 
     def _share(
@@ -490,7 +493,7 @@ class Primary:
         A step beside an edge tells this too late: behind its outline a round surface comes forward by the root of the step, so
         that a ray beside an outline below a floor meets what stands out of the floor.
         """
-        o, d = self.bodies.camera.rays(s[0], s[1], lens)
+        o, d = self.bodies.film.rays(s, lens)
         o = o.expand_as(d)
         reach = ((place.p - o) * d).sum(0)
         t, prim = self.traced.nearest(o, d, _ending_at(reach, _NEAR, key))

@@ -24,10 +24,11 @@ import torch
 from torch import Tensor
 
 from torchpt.gradients.edges.bodies import Bodies, Held
-from torchpt.gradients.edges.film import Worth, film_places, slopes
+from torchpt.gradients.edges.cotangents import Cotangents
+from torchpt.gradients.edges.film import Worth, flat_places
 from torchpt.gradients.edges.traced import Passing, Traced
 from torchpt.gradients.edges.vertices import Spot, met
-from torchpt.math.vectors import cross, dot, largest, rows, take
+from torchpt.math.vectors import dot, lanes_of, largest, rows, take
 from torchpt.paths.roulette import russian_roulette, survival_probability
 from torchpt.physics.shapes.interaction import slide_share
 
@@ -45,8 +46,6 @@ _ROULETTE = 3
 _TO_CAMERA = 1 << 12
 #: What is met so far from a point, against the way to the camera, is behind that.
 _TO_LENS = 2.0**-20
-#: Pixels beside the film that are looked at, for wide filters.
-_MARGIN = 16.0
 
 
 @dataclass(frozen=True)
@@ -71,6 +70,11 @@ class MovingFrame:
     holds_first: bool
     camera_moves: bool
 
+    @property
+    def follows_camera(self) -> bool:
+        """Return True if what the camera sees moves with it."""
+        return self.camera_moves and not self.holds_first
+
     def share(self, prim: Tensor, r: Tensor) -> Tensor:
         """Return the share ``(N,)`` by which points slide at the ends of rays of length ``r (N,)``; 1 where these miss."""
         world = self.traced.wave.context.world
@@ -78,13 +82,21 @@ class MovingFrame:
 
     def rounding(self, prim: Tensor, *points: Tensor) -> Tensor:
         """Return the rounding of points ``(3, N)`` of primitives that the search finds ``(N,)``."""
-        p0, *axes = self.bodies.place(prim)
-        size = p0.abs() + sum((axis.abs() for axis in axes), torch.zeros_like(p0))
-        return torch.stack([largest(p.abs()) for p in (size, *points)]).amax(0) * _ROUNDING
+        size = largest(self.bodies.sizes(prim))
+        for p in points:
+            size = torch.maximum(size, largest(p.abs()))
+        return size * _ROUNDING
 
     def lift(self, prim: Tensor, n: Tensor) -> Tensor:
         """Return how far off primitives ``(N,)`` rays begin along their normals ``n (3, N)``; little if these are axes."""
         return _LIFT * self.bodies.rounding(n, prim)
+
+    def emits(self, prim: Tensor) -> Tensor:
+        """Return a mask of primitives ``(N,)`` that emit light."""
+        world = self.traced.wave.context.world
+        if world.lights is None or world.lights.row_of_prim is None:
+            return torch.zeros_like(prim, dtype=torch.bool)
+        return take(world.lights.row_of_prim, world.geometry.slot(prim)) >= 0
 
     def moving(self, prim: Tensor) -> Tensor:
         """Return a mask ``(N,)`` of primitives that move; False where ``prim`` is -1."""
@@ -114,6 +126,7 @@ class Prefix:
         frame: of the interior.
         lane: ``(M,)`` the receivers.
         weight: ``(3, M)`` worth of the light that arrives at them, by area.
+        moves: ``(M,)`` bool: the paths move.
         place: ``(2, M)`` of the paths on the film.
         lens: ``(2, M)`` samples of the lens that they pass; None: there is none.
         chain: vertices behind the camera, first that which it sees, of these paths and others; the last is the receiver.
@@ -123,6 +136,7 @@ class Prefix:
     frame: MovingFrame
     lane: Tensor
     weight: Tensor
+    moves: Tensor
     place: Tensor
     lens: Tensor | None
     chain: tuple[PathVertex, ...]
@@ -140,42 +154,45 @@ class Prefix:
 
     def taken(self, index: Tensor) -> Prefix:
         """Return some of the lanes."""
-        lane, weight, place, lens, columns = rows((self.lane, self.weight, self.place, self.lens, self.columns), index)
-        return Prefix(self.frame, lane, weight, place, lens, self.chain, columns)
-
-    def moves(self, first: int | None = None) -> Tensor:
-        """Return a mask ``(M,)`` of the paths that move; ``first``: by so many vertices only."""
-        if self.frame.camera_moves and not self.frame.holds_first:
-            return torch.ones_like(self.lane, dtype=torch.bool)
-        moving = torch.zeros_like(self.lane, dtype=torch.bool)
-        for vertex, column in zip(self.chain[:first], self.columns, strict=False):
-            moving = moving | self.frame.moving(take(vertex.held.prim, column))
-        return moving
+        own = self.lane, self.weight, self.moves, self.place, self.lens, self.columns
+        lane, weight, moves, place, lens, columns = rows(own, index)
+        return Prefix(self.frame, lane, weight, moves, place, lens, self.chain, columns)
 
     def motion(self) -> Tensor:
         """Return about how far receivers move where all that moves does by 1 ``(M,)``."""
-        how = self.moves(1).double()
+        how = (self.moves if self.frame.follows_camera else self.frame.moving(self.vertices[0].held.prim)).double()
         for before, vertex in pairwise(self.vertices):
             away = vertex.p - before.p
             share = self.frame.share(vertex.held.prim, dot(away, away).sqrt())
             how = (1.0 - share) * self.frame.moving(vertex.held.prim) + share * how
         return how
 
-    def receivers(self, bodies: Bodies) -> Tensor:
-        """Return where the receivers are in the interior's frame ``(3, M)``, differentiable in ``bodies``."""
+    def pull_back(self, cotangents: Cotangents, cotangent: Tensor) -> None:
+        """Add the cotangents of all that moves receivers, by one of where these are in the interior's frame ``(3, M)``."""
+        some = self.moves.nonzero().squeeze(1)
+        if len(some) < len(self.lane):
+            if len(some):
+                self.taken(some).pull_back(cotangents, take(cotangent, some))
+            return
         first, *others = self.vertices
-        x = bodies.points(first.held)
-        if not self.frame.holds_first:
-            o, d = bodies.camera.rays(self.place[0], self.place[1], self.lens)
-            x = o + d * (dot(first.n, x - o) / dot(first.n, d))
-        before = first.p
-        for vertex in others:
-            away = vertex.p - before
-            r = dot(away, away).sqrt()
-            at = bodies.points(vertex.held)
-            slid = x + away * (dot(vertex.n, at - x) / dot(vertex.n, away))
-            x, before = at + (slid - at) * self.frame.share(vertex.held.prim, r), vertex.p
-        return x
+        chain = [(before, vertex) for before, vertex in zip(self.vertices, others, strict=False)]
+        for before, vertex in reversed(chain):
+            away = vertex.p - before.p
+            share = self.frame.share(vertex.held.prim, dot(away, away).sqrt())
+            # The point of the vertex, in the part that slides, is that of the vertex before moved along the ray.
+            slid = vertex.n * (dot(away, cotangent) / dot(vertex.n, away))
+            cotangents.add_points(vertex.held, cotangent * (1.0 - share) + slid * share)
+            cotangent = (cotangent - slid) * share
+        if self.frame.holds_first:
+            cotangents.add_points(first.held, cotangent)
+            return
+        o, d = self.frame.bodies.film.rays(self.place, self.lens)
+        steep = dot(first.n, d)
+        slid = first.n * (dot(d, cotangent) / steep)
+        cotangents.add_points(first.held, slid)
+        if self.frame.camera_moves:
+            rest, away = cotangent - slid, self.frame.bodies.points(first.held) - o
+            cotangents.add_rays(self.place, self.lens, rest, rest * (dot(first.n, away) / steep))
 
 
 def prefixes_of(
@@ -206,42 +223,43 @@ def prefixes_of(
     lane = torch.arange(wi.shape[1], device=wi.device)
     carried = torch.ones_like(wi)
     chain, columns = (_vertex(frame, spot),), (lane,)
+    every = torch.ones_like(lane, dtype=torch.bool)
+    moving = every if frame.follows_camera else frame.moving(spot.hit.prim)
     for k in range(1, longest + 1):
-        index, place, lens, wo = _seen(frame, spot, Passing(take(key, lane), _TO_CAMERA + k))
+        counts = take(every, lane) if moves is None else moving | take(moves, lane)
+        index, place, lens, wo = _seen(frame, spot, counts, Passing(key, _TO_CAMERA + k))
         if len(index):
             seen = spot.taken(index)
             back = take(wi, index).to(spot.p)
             own = None if side is None else take(side, index)
             sent = seen.sent(wo.to(spot.p), back, own).double()
-            _, jacobian = slopes(frame.bodies.camera, seen.p.double(), lens)
-            area = dot(cross(jacobian[0], jacobian[1]), seen.n.double()).abs()
+            area = frame.bodies.film.area(seen.p.double(), seen.n.double(), lens)
             weight = frame.worth.at(place) * sent * take(carried, index) * area
-            prefix = Prefix(frame, take(lane, index), weight, place, lens, chain, rows(columns, index))
-            counts = (weight != 0).any(0)
-            if moves is not None:
-                counts &= prefix.moves() | take(moves, prefix.lane)
-            some = counts.nonzero().squeeze(1)
+            own = take(lane, index), weight, take(moving, index), place, lens
+            prefix = Prefix(frame, *own, chain, rows(columns, index))
+            some = (weight != 0).any(0).nonzero().squeeze(1)
             if len(some):
                 found.append(prefix.taken(some))
         if k == longest:
             break
-        o, d, weight = spot.scattered(wi.to(spot.p), take(key, lane), k + 1, side)
+        o, d, weight = spot.scattered(wi.to(spot.p), key, k + 1, side)
         side = None
         carried = carried * weight.double()
         alive = (carried != 0).any(0)
         if k >= _ROULETTE:
-            draws = frame.traced.draws(take(key, lane), k + 1)
+            draws = frame.traced.draws(key, k + 1)
             chance = survival_probability(None, 1.0, largest(carried.abs()), None)
             alive, carried = russian_roulette(chance, draws, alive, carried)
-        on = alive.nonzero().squeeze(1)
-        spot = met(frame.traced, take(o, on), take(d, on), Passing(take(key, take(lane, on)), k + 1))
-        some = (spot.hit.prim >= 0).nonzero().squeeze(1)
-        kept = take(on, some)
-        if not len(kept):
+        on = lanes_of(alive)
+        spot = met(frame.traced, take(o, on), take(d, on), Passing(take(key, on), k + 1))
+        some = lanes_of(spot.hit.prim >= 0)
+        kept = on if some is None else some if on is None else take(on, some)
+        spot, (lane, key, carried) = spot.taken(some), rows((lane, key, carried), kept)
+        if not len(lane):
             break
-        lane, carried, spot = take(lane, kept), take(carried, kept), spot.taken(some)
+        moving = take(moving, kept) | frame.moving(spot.hit.prim)
         chain = _vertex(frame, spot), *chain
-        columns = torch.arange(len(kept), device=wi.device), *rows(columns, kept)
+        columns = torch.arange(len(lane), device=wi.device), *rows(columns, kept)
         wi = -spot.d.double()
     return found
 
@@ -275,27 +293,31 @@ def _vertex(frame: MovingFrame, spot: Spot) -> PathVertex:
     return PathVertex(spot.held(frame.bodies), spot.p.double(), spot.n.double())
 
 
-def _seen(frame: MovingFrame, spot: Spot, passing: Passing) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
-    """Return which points the camera sees ``(n,)``, their places on the film and on the lens, and directions to the camera.
+def _seen(
+    frame: MovingFrame, spot: Spot, counts: Tensor, passing: Passing
+) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
+    """Return which points the picture sees ``(n,)``, their places on the film and on the lens, and directions to the camera.
 
-    ``passing``: decides which surfaces between them rays pass by their opacity; its numbers choose points on the lens too.
+    Args:
+        frame: of the interior.
+        spot: the points.
+        counts: mask ``(N,)`` of those that are looked at.
+        passing: decides which surfaces between them rays pass by their opacity; its numbers choose points on the lens too.
     """
-    camera, x = frame.bodies.camera, spot.p.double()
+    film, x = frame.bodies.film, spot.p.double()
     lens = frame.traced.lens(passing.key, passing.depth)
-    seen = camera.film_of(x, lens)
-    assert seen is not None
-    s = film_places(camera, x, lens)
-    width, height = camera.resolution
-    good = (seen[2] > 0) & (seen[3] > 0) & (s > -_MARGIN).all(0) & (s[0] < width + _MARGIN) & (s[1] < height + _MARGIN)
-    index = good.nonzero().squeeze(1)
+    seen = film.of(x, lens)
+    s = flat_places(seen)
+    x0, x1, y0, y1 = frame.worth.bounds()
+    counts = counts & (seen[2] > 0) & (seen[3] > 0) & (s[0] >= x0) & (s[0] <= x1) & (s[1] >= y0) & (s[1] <= y1)
+    index = counts.nonzero().squeeze(1)
     s, x, lens = rows((s, x, lens), index)
-    o, d = camera.rays(s[0], s[1], lens)
+    o, d = film.rays(s, lens)
     o = o.expand_as(d)
     # From the point: the rounding of a ray from far away is more than what may lie before the point.
     n, prim = take(spot.n, index).double(), take(spot.hit.prim, index)
     lift = torch.maximum(frame.lift(prim, n), largest(x.abs()) * _ROUNDING)
     begin = x - n * (torch.sign(dot(n, d)) * lift)
     passing = replace(passing, key=take(passing.key, index))
-    t, _ = frame.traced.nearest(begin, -d, passing)
-    some = (t > dot(begin - o, d) * (1.0 - _TO_LENS)).nonzero().squeeze(1)
+    some = (~frame.traced.blocked(begin, -d, dot(begin - o, d) * (1.0 - _TO_LENS), passing)).nonzero().squeeze(1)
     return take(index, some), take(s, some), rows(lens, some), -take(d, some)

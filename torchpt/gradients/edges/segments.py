@@ -24,11 +24,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from torchpt.gradients.edges.bodies import Bodies, Held
+from torchpt.gradients.edges.cotangents import Cotangents
 from torchpt.gradients.edges.curves import smooth_faces
 from torchpt.gradients.edges.cuts import Crossing, crossing_of
 from torchpt.gradients.edges.occluders import Occluders
@@ -293,6 +295,7 @@ class SegmentSamples:
     """Samples of segments; the derivative of the loss is that of :meth:`sum`.
 
     Attributes:
+        frame: of the interior.
         number: of the samples ``(N,)``.
         edge: the places on edges.
         mate: the other face at each ``(N,)``; -1: there is none.
@@ -303,6 +306,7 @@ class SegmentSamples:
         crossing: those of the places where surfaces cut.
     """
 
+    frame: MovingFrame
     number: Tensor
     edge: Held
     mate: Tensor
@@ -314,35 +318,56 @@ class SegmentSamples:
 
     def sum(self, bodies: Bodies) -> Tensor:
         """Return a number, differentiable in ``bodies``; of no meaning but for its derivative."""
-        value = torch.zeros((), dtype=self.r.dtype, device=self.r.device)
-        p = bodies.points(self.edge)
-        e = dot(self.m, p if self.crossing is None else self.crossing.moved(bodies, p))
-        ends = [dot(self.m, bodies.points(side.held)) for side in self.sides]
-        for prefix, light in self.prefixes:
-            lane = prefix.lane
-            x = dot(take(self.m, lane), prefix.receivers(bodies))
-            c = take(e, lane) - x
-            for side, end, arrives in zip(self.sides, ends, light, strict=True):
-                d = (take(end, lane) - x) * take(self.r / side.r, lane)
-                value = value - side.sign * ((c - (1.0 - take(side.share, lane)) * d) * arrives).sum()
-        return value
+        cotangents, motions = Cotangents(self.frame.moves), self._motions
+        edge = self.m * motions.edge
+        cotangents.add_points(self.edge, edge)
+        if self.crossing is not None:
+            self.crossing.pull_back(cotangents, edge)
+        for side, end in zip(self.sides, motions.ends, strict=True):
+            cotangents.add_points(side.held, self.m * end)
+        for (prefix, _), receivers in zip(self.prefixes, motions.receivers, strict=True):
+            prefix.pull_back(cotangents, take(self.m, prefix.lane) * receivers)
+        return cotangents.sum(bodies)
 
-    def brought(self, frame: MovingFrame) -> Tensor:
+    def brought(self) -> Tensor:
         """Return the root of the sum of squares ``(N,)`` of the derivatives by how far edges, receivers and ends move."""
-        size = torch.zeros_like(self.r)
-        edge, ends, receivers = size.clone(), [size.clone() for _ in self.sides], size.clone()
-        for prefix, light in self.prefixes:
-            lane, x = prefix.lane, torch.zeros_like(light[0])
-            for side, end, arrives in zip(self.sides, ends, light, strict=True):
-                turned = take((1.0 - side.share) * self.r / side.r, lane) * arrives
-                end.index_add_(0, lane, turned)
-                edge.index_add_(0, lane, side.sign * arrives)
-                x += side.sign * (arrives - turned)
-            receivers.index_add_(0, lane, x.abs() * prefix.motion())
-        square = (frame.moving(self.edge.prim) | frame.moving(self.mate)) * edge.square() + receivers.square()
-        for side, end in zip(self.sides, ends, strict=True):
+        motions, receivers = self._motions, torch.zeros_like(self.r)
+        for (prefix, _), of_prefix in zip(self.prefixes, motions.receivers, strict=True):
+            receivers.index_add_(0, prefix.lane, of_prefix.abs() * prefix.motion())
+        moves = self.frame.moving(self.edge.prim) | self.frame.moving(self.mate)
+        square = moves * motions.edge.square() + receivers.square()
+        for side, end in zip(self.sides, motions.ends, strict=True):
             square += side.moves * end.square()
         return square.sqrt()
+
+    @cached_property
+    def _motions(self) -> Motions:
+        edge, ends, receivers = torch.zeros_like(self.r), [torch.zeros_like(self.r) for _ in self.sides], list[Tensor]()
+        turns = [side.sign * (1.0 - side.share) * self.r / side.r for side in self.sides]
+        for prefix, light in self.prefixes:
+            lane, x = prefix.lane, torch.zeros_like(light[0])
+            for side, turn, end, arrives in zip(self.sides, turns, ends, light, strict=True):
+                turned = take(turn, lane) * arrives
+                end.index_add_(0, lane, turned)
+                edge.index_add_(0, lane, arrives, alpha=-side.sign)
+                x += side.sign * arrives - turned
+            receivers.append(x)
+        return Motions(edge, ends, receivers)
+
+
+@dataclass(frozen=True)
+class Motions:
+    """Derivatives by motions along ``m``.
+
+    Attributes:
+        edge: of edges ``(N,)``.
+        ends: of what is seen on both sides ``(N,)``.
+        receivers: of the receivers of each prefix ``(M,)``.
+    """
+
+    edge: Tensor
+    ends: list[Tensor]
+    receivers: list[Tensor]
 
 
 @dataclass(frozen=True)
@@ -371,7 +396,7 @@ class Segments:
         rays, spot, lane = self._receivers(self.sampler.draw(u[0], u[1:], aim, coins), key)
         found = self._samples(rays, spot, *rows((number, key, scale), lane)) if len(lane) else None
         if turn.memory is not None and found is not None:
-            brought = torch.zeros_like(scale).index_add_(0, found.number - number[0], found.brought(self.frame))
+            brought = torch.zeros_like(scale).index_add_(0, found.number - number[0], found.brought())
             turn.record(u, scale, brought)
         return found
 
@@ -423,18 +448,20 @@ class Segments:
         for y in seen:
             moves = moves | self.frame.moving(y.hit.prim)
         found = prefixes_of(self.frame, receiver, -rays.omega, key, self.depth, behind=2, moves=moves)
-        prefixes = []
         # Light behind the edge costs more than paths to the camera.
-        for prefix in one_of_each(found, self.frame.traced.draws(key).one(Dimension.ROULETTE).double()):
-            depth = self.depth if self.depth < 0 else self.depth - prefix.count
-            scale = prefix.weight * take(weight, prefix.lane)
-            light = self._reflected(seen, free, number, prefix.lane, depth)
-            prefixes.append((prefix, (scale[:, None] * light).sum(0)))
-        if not prefixes:
+        chosen = one_of_each(found, self.frame.traced.draws(key).one(Dimension.ROULETTE).double())
+        if not chosen:
             return None
+        depths = [self.depth if self.depth < 0 else self.depth - prefix.count for prefix in chosen]
+        light = self._reflected(seen, free, number, [prefix.lane for prefix in chosen], depths)
+        prefixes = []
+        for prefix in chosen:
+            scale = prefix.weight * take(weight, prefix.lane)
+            arrives = take(light.view(6, -1), prefix.lane).view(3, 2, -1)
+            prefixes.append((prefix, (scale[:, None] * arrives).sum(0)))
         sides = [self._side(sign, y, r) for sign, y in zip(_SIGNS, seen, strict=True)]
         crossing = crossing_of(self.frame.bodies, rays.cut, rays.held, rays.mate)
-        return SegmentSamples(number, rays.held, rays.mate, rays.m, r, sides, prefixes, crossing)
+        return SegmentSamples(self.frame, number, rays.held, rays.mate, rays.m, r, sides, prefixes, crossing)
 
     def _ends_at(self, rays: SegmentRays, y: Spot, r: Tensor, step: Tensor) -> Tensor:
         """Return a mask ``(N,)`` of rays beside edges that do not end before these, but for what touches there."""
@@ -456,23 +483,41 @@ class Segments:
         share, moves = self.frame.share(y.hit.prim, reach), self.frame.moving(y.hit.prim)
         return Side(sign, y.held(self.frame.bodies), reach, share, moves)
 
-    def _reflected(self, seen: list[Spot], free: Tensor, number: Tensor, lane: Tensor, depth: int) -> Tensor:
-        """Return the light ``(3, 2, M)`` that what was met reflects in lanes ``(M,)``, by paths of so many vertices.
+    def _reflected(
+        self, seen: list[Spot], free: Tensor, number: Tensor, lanes: list[Tensor], depths: list[int]
+    ) -> Tensor:
+        """Return the light ``(3, 2, N)`` that what was met reflects, by paths of so many vertices.
 
-        ``free``: distances before which surfaces that are not opaque let everything pass.
+        Args:
+            seen: what was met on both sides.
+            free: distances ``(N,)`` before which surfaces that are not opaque let everything pass.
+            number: of the samples ``(N,)``.
+            lanes: groups of lanes, none of which is in two groups; in others there is no light.
+            depths: vertices of paths at most, of each group.
         """
-        found = torch.zeros(3, len(seen) * len(lane), dtype=torch.float64, device=lane.device)
-        met_some = torch.cat([take(y.hit.prim, lane) for y in seen]) >= 0
-        some = met_some.nonzero().squeeze(1)
-        if len(some):
-            traced, mine = self.frame.traced, torch.cat([lane] * len(seen))
-            o, d = (
-                torch.cat([take(t, lane) for t in sides], 1) for sides in zip(*((y.o, y.d) for y in seen), strict=True)
-            )
-            if traced.has_opacity:
-                t = torch.cat([torch.minimum(free, y.hit.t.double() * (1.0 - _NEAR))[lane] for y in seen])
-                o = o.double() + d.double() * t.clamp_min(0.0)
-            rays = take(o, some), take(d, some).double(), take(number, take(mine, some)), Use.BEHIND
-            radiance = traced.radiance(*rays, depth)
-            found[:, some] = radiance - traced.radiance(*rays, 1)  # without light of sources themselves
-        return found.view(3, len(seen), -1)
+        traced, n = self.frame.traced, len(number)
+        o, d = (torch.cat(both, 1) for both in zip(*((y.o, y.d) for y in seen), strict=True))
+        prim = torch.cat([y.hit.prim for y in seen])
+        if traced.has_opacity:
+            t = torch.cat([torch.minimum(free, y.hit.t.double() * (1.0 - _NEAR)) for y in seen])
+            o = o.double() + d.double() * t.clamp_min(0.0)
+        found = torch.zeros(3, 2 * n, dtype=torch.float64, device=number.device)
+
+        def add(index: Tensor, depth: int, sign: float) -> None:
+            if len(index):
+                rays = take(o, index), take(d, index).double(), take(number, index % n), Use.BEHIND
+                found.index_add_(1, index, traced.radiance(*rays, depth), alpha=sign)
+
+        met_some = []
+        for depth in dict.fromkeys(depths):
+            same = [lane for lane, of_lane in zip(lanes, depths, strict=True) if of_lane == depth]
+            index = torch.cat([lane + side * n for side in range(len(seen)) for lane in same])
+            index = take(index, (take(prim, index) >= 0).nonzero().squeeze(1))
+            add(index, depth, 1.0)
+            met_some.append(index)
+        # Without light of sources themselves; where rays pass nothing it is known which of them meet any.
+        index = torch.cat(met_some)
+        if not traced.has_opacity:
+            index = take(index, self.frame.emits(take(prim, index)).nonzero().squeeze(1))
+        add(index, 1, -1.0)
+        return found.view(3, len(seen), n)

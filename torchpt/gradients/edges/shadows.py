@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchpt.gradients.edges.bodies import Bodies, Held
+from torchpt.gradients.edges.cotangents import Cotangents
 from torchpt.gradients.edges.curves import View
 from torchpt.gradients.edges.occluders import Occluders, OutlinePoints
 from torchpt.gradients.edges.receivers import MovingFrame, Prefix, prefixes_of
@@ -17,6 +18,7 @@ from torchpt.gradients.edges.vertices import Spot, met
 from torchpt.math.guiding import Round
 from torchpt.math.sampling import Distribution1D, concentric_disk, uniform_sphere, uniform_triangle
 from torchpt.math.vectors import cross, dot, luminance, rows, take
+from torchpt.paths.state import T_MAX
 from torchpt.paths.vertex import light_radiance
 from torchpt.physics.lights import KINDS, SURFACES, from_digits
 from torchpt.physics.lights.base import Environment, lane_rows
@@ -223,6 +225,8 @@ class Cast:
     """Samples of shadow edges; the derivative of the loss is that of :meth:`sum`.
 
     Attributes:
+        frame: of the interior.
+        lights_move: True: lights may move.
         beam: where light comes from.
         source: ``(N,)`` column of ``Bodies.lights``, -1 for what is held on a surface, -2 for what does not move.
         edge: the places past which it goes.
@@ -231,6 +235,8 @@ class Cast:
         prefixes: of the receivers, each with weights ``(3, M)`` of their motion over the receiver.
     """
 
+    frame: MovingFrame
+    lights_move: bool
     beam: Beam
     source: Tensor
     edge: Held
@@ -240,22 +246,32 @@ class Cast:
 
     def sum(self, bodies: Bodies) -> Tensor:
         """Return a number, differentiable in ``bodies``; of no meaning but for its derivative."""
-        e, w = self._from(bodies), self.beam.view.w
-        p, held = bodies.points(self.edge), bodies.points(self.receiver)
-        toward = e - p * w
-        x = p - toward * (dot(self.normal, p - held) / dot(self.normal, toward))
-        value = torch.zeros((), dtype=x.dtype, device=x.device)
+        cotangents, still = Cotangents(self.frame.moves), self.frame.bodies
+        p, n, w = still.points(self.edge), self.normal, self.beam.view.w
+        x = torch.zeros_like(p)
         for prefix, weight in self.prefixes:
-            value = value + ((take(x, prefix.lane) - prefix.receivers(bodies)) * weight).sum()
-        return value
+            x.index_add_(1, prefix.lane, weight)
+            prefix.pull_back(cotangents, -weight)
+        # Light goes from e past p to the receiver's plane: to p - toward (n . (p - held)) / (n . toward).
+        toward = self.beam.view.toward(p)
+        steep = dot(n, toward)
+        far = dot(n, p - still.points(self.receiver)) / steep
+        on_plane = n * (dot(x, toward) / steep)
+        rest = x - on_plane
+        cotangents.add_points(self.receiver, on_plane)
+        cotangents.add_points(self.edge, rest * (1.0 + far * w))
+        self._pull_back_lights(cotangents, rest * -far)
+        return cotangents.sum(bodies)
 
-    def _from(self, bodies: Bodies) -> Tensor:
-        e = torch.where(self.source == -1, bodies.points(self.beam.held), self.beam.view.e)
-        if not bodies.lights.shape[1]:
-            return e
-        own = take(bodies.lights, self.source.clamp_min(0))
-        far = torch.as_tensor(self.beam.view.w, device=e.device) == 0
-        return torch.where(self.source >= 0, torch.where(far, -own, own), e)
+    def _pull_back_lights(self, cotangents: Cotangents, cotangent: Tensor) -> None:
+        """Add what a cotangent ``(3, N)`` of where light comes from asks."""
+        surface = (self.source == -1).nonzero().squeeze(1)
+        cotangents.add_points(rows(self.beam.held, surface), take(cotangent, surface))
+        own = (self.source >= 0).nonzero().squeeze(1)
+        if len(own) and self.lights_move:
+            far = torch.as_tensor(self.beam.view.w, device=own.device) == 0
+            cotangent = torch.where(far, -cotangent, cotangent)  # distant lights are where they go
+            cotangents.add_lights(take(self.source, own), take(cotangent, own))
 
 
 @dataclass(frozen=True)
@@ -320,8 +336,8 @@ class Shadows:
         keys = torch.cat((key, key), 1)
         # Behind a body's front an edge may throw a shadow's border too: both rays have to come from the light.
         aim = torch.where(w > 0, beam.view.e - o, -away)
-        t, prim = traced.nearest(beside, torch.cat((aim, aim), 1), Passing(keys, depth=_TO_LIGHT))
-        lit = ((prim < 0).view(2, n) | ((w > 0) & (t.view(2, n) > 1.0 - _END))).all(0)
+        far = torch.where(w > 0, 1.0 - _END, T_MAX).repeat(2)
+        lit = ~traced.blocked(beside, torch.cat((aim, aim), 1), far, Passing(keys, depth=_TO_LIGHT)).view(2, n).any(0)
         t, prim = traced.nearest(beside, torch.cat((away, away), 1), Passing(keys, depth=1))
         t, prim = t.view(2, n), prim.view(2, n)
         own = (prim == passed.held.prim) | ((prim == passed.mate) & (passed.mate >= 0))
@@ -369,7 +385,8 @@ class Shadows:
             prefixes.append((prefix, take(edge, prefix.lane) * value))
         if not prefixes:
             return None
-        return Cast(beam, self._source(beam), passed.held, spot.held(self.frame.bodies), n, prefixes)
+        source, receiver = self._source(beam), spot.held(self.frame.bodies)
+        return Cast(self.frame, self.lights_move, beam, source, passed.held, receiver, n, prefixes)
 
     def _source(self, beam: Beam) -> Tensor:
         """Return columns of ``Bodies.lights``; see :class:`Cast`."""

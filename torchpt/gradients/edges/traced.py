@@ -67,8 +67,9 @@ class Along:
         return values if clamp is None else values * clamp_scale(values, clamp)
 
     def _by_kernels(self, wave: Wave, sample: int) -> Tensor:
-        self._kernels = kernels_of(self._scene, wave, self._kernels)
-        engine = forward_kernels(self._kernels)
+        if self._kernels is None:
+            self._kernels = kernels_of(self._scene, wave)
+        engine = forward_kernels(self._kernels.with_rays(wave))
         pixel_set = PixelSet(Film(wave.crop[2], 1, 1, wave.centre.device))
         engine.run([(pixel_set, sample, 1)], lambda _: False)
         engine.release_workers(self._keep)
@@ -167,6 +168,16 @@ class Traced:
         """
         hit = self.intersect(o, d, passing)
         return hit.t.double(), hit.prim
+
+    def blocked(self, o: Tensor, d: Tensor, far: Tensor, passing: Passing | None = None) -> Tensor:
+        """Return a mask ``(N,)`` of rays that meet something before ``far (N,)``, in units of ``d``.
+
+        ``passing``: as for :meth:`nearest`.
+        """
+        if passing is not None and self.has_opacity:
+            t, prim = self.nearest(o, d, passing)
+            return (prim >= 0) & (t < far)
+        return self.wave.accel.occluded(o, d, far.float())
 
     def intersect(self, o: Tensor, d: Tensor, passing: Passing | None = None) -> Hit:
         """Return the hits of rays ``(3, N)``, distances in units of ``d``; ``passing``: as for :meth:`nearest`."""

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchpt.gradients.edges.bodies import Bodies, Held
 from torchpt.gradients.edges.traced import Passing, Traced
 from torchpt.math.sampling import uniform_hemisphere
-from torchpt.math.vectors import Frame, cross, dot, rows, take
+from torchpt.math.vectors import Frame, cross, dot, lanes_of, rows, take
 from torchpt.paths.integrators.path import partition
 from torchpt.paths.state import Drawn, Plan
 from torchpt.paths.surface import Surface, surface_at
@@ -54,9 +54,9 @@ class Spot:
     p: Tensor
     n: Tensor
 
-    def taken(self, index: Tensor) -> Spot:
-        """Return some of the lanes."""
-        return Spot(self.traced, *rows((self.o, self.d, self.hit, self.p, self.n), index))
+    def taken(self, index: Tensor | None) -> Spot:
+        """Return some of the lanes; None: all."""
+        return self if index is None else Spot(self.traced, *rows((self.o, self.d, self.hit, self.p, self.n), index))
 
     def held(self, bodies: Bodies) -> Held:
         """Return the points held on their surfaces; any point in lanes that missed."""
@@ -70,13 +70,16 @@ class Spot:
             a[:, bent] = torch.stack([dot(face, away) / det for face in faces])
         return Held(prim, a)
 
-    def _each(self, found: list[Tensor], make: Callable[[int, Tensor, Interaction], list[Tensor]]) -> None:
+    def _each(self, found: list[Tensor], make: Callable[[int, Tensor | None, Interaction], list[Tensor]]) -> None:
         """Fill in what each model makes of its lanes."""
-        _, groups = partition(self.traced.wave.context.world, self.hit)
+        world = self.traced.wave.context.world
+        if len(world.materials.models) == 1 and bool((self.hit.prim >= 0).all()):
+            for into, value in zip(found, make(0, None, interact(world, self.o, self.d, self.hit)), strict=True):
+                into.copy_(value)
+            return
+        _, groups = partition(world, self.hit)
         for model, index in groups:
-            at = interact(
-                self.traced.wave.context.world, take(self.o, index), take(self.d, index), rows(self.hit, index)
-            )
+            at = interact(world, take(self.o, index), take(self.d, index), rows(self.hit, index))
             for into, value in zip(found, make(model, index, at), strict=True):
                 into.index_copy_(into.dim() - 1, index, value.to(into.dtype))
 
@@ -88,7 +91,7 @@ class Spot:
         """
         out = torch.zeros_like(wo)
 
-        def make(model: int, index: Tensor, at: Interaction) -> list[Tensor]:
+        def make(model: int, index: Tensor | None, at: Interaction) -> list[Tensor]:
             own = None if side is None else take(side, index)
             return [self._weighed(model, at, take(wo, index), take(wi, index), own)]
 
@@ -127,7 +130,7 @@ class Spot:
         context = self.traced.wave.context
         world = context.world
 
-        def make(model: int, index: Tensor, at: Interaction) -> list[Tensor]:
+        def make(model: int, index: Tensor | None, at: Interaction) -> list[Tensor]:
             kind, back = world.materials.models[model], take(wi, index)
             if kind.smooth:
                 return [torch.zeros_like(at.p), back, torch.zeros_like(back)]
@@ -176,11 +179,12 @@ def met(traced: Traced, o: Tensor, d: Tensor, passing: Passing | None = None) ->
         passing: decides which surfaces rays pass by their opacity; its distances are in the lanes' unit of length. None: none.
     """
     world, dtype = traced.wave.context.world, traced.dtype
-    d = (d / (d * d).sum(0).sqrt()).to(dtype)
-    o = o.to(dtype)
+    o, d = o.to(dtype), (d / (d * d).sum(0).sqrt()).to(dtype)
     hit = traced.intersect(o, d, passing)
     hit = Hit(hit.t.to(dtype), hit.prim, hit.u.to(dtype), hit.v.to(dtype))
-    p, n = torch.zeros_like(d), torch.zeros_like(d)
-    some = (hit.prim >= 0).nonzero().squeeze(1)
+    some = lanes_of(hit.prim >= 0)
     at = interact(world, take(o, some), take(d, some), rows(hit, some))
+    if some is None:
+        return Spot(traced, o, d, hit, at.p, at.ng)
+    p, n = torch.zeros_like(d), torch.zeros_like(d)
     return Spot(traced, o, d, hit, p.index_copy(1, some, at.p), n.index_copy(1, some, at.ng))
