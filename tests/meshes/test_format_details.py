@@ -276,6 +276,7 @@ def test_the_picture_of_an_exr(tmp_path, names, values):
     spec = oiio.ImageSpec(1, 1, len(names), "float")
     spec.channelnames = names
     file = oiio.ImageOutput.create("a.exr")
+    assert file is not None
     file.open(str(tmp_path / "a.exr"), spec)
     file.write_image(np.arange(1, len(names) + 1, dtype=np.float32).reshape(1, 1, -1))
     file.close()
