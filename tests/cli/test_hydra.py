@@ -107,7 +107,7 @@ def test_types_are_chosen_by_file_or_by_key(
                    "filter": "box", "tonemap": "a, b"},
           "integrator": {"clamp": None, "strict": True, "strategy": "yes"}, "sampler": {"adaptive": False},
           "render": {"seed": 1000.0, "compile": "off", "preview": "a=b.png"}}),
-        (["film.filter.radius=NULL", "film.filter.type=null"], {"film": {}}),
+        (["film.filter.radius=NULL", "film.filter.type=null"], {"film": {"filter": {"type": None, "radius": None}}}),
     ],
 )  # fmt: skip
 def test_words_become_settings_of_their_types(

@@ -107,6 +107,16 @@ def test_settings_reach_the_renderer(folder: Path, renderer: Renderer) -> None:
     assert settings.sampler.name == "independent" and settings.render.spp == 2 and settings.render.compile == "off"
 
 
+@pytest.mark.parametrize(
+    "word", ["film.filter.stddev=null", "film.filter.stddev=Null", "film={filter: {stddev: null}}"]
+)
+def test_null_below_a_block_unsets_it_in_any_spelling(folder: Path, renderer: Renderer, word: str) -> None:
+    """A scene's own width of a filter gives way to the default."""
+    (folder / "wide.yaml").write_text("defaults: [s]\nfilm: {filter: {type: gaussian, stddev: 3}}\n")
+    assert main(["render", "scene=wide.yaml"]) == 0 and main(["render", "scene=wide.yaml", word]) == 0
+    assert [settings.film.filter.values["stddev"] for settings in renderer.settings] == [3.0, 0.5]
+
+
 def test_an_explicit_null_unsets_the_scenes_wish(folder: Path, renderer: Renderer) -> None:
     assert main(["render", "scene=s.yaml", "integrator.clamp=null", "render.spp=null", "film.filter.type=box"]) == 0
     assert renderer.settings[0].integrator.clamp is None and renderer.settings[0].render.spp == 64

@@ -253,6 +253,8 @@ def _add_option(arguments: Arguments, word: str, remaining_words: Iterator[str])
     _, takes_value = _OPTIONS[option]
     if takes_value:
         value = value or next(remaining_words, "")
+        if not value and option != "--cfg":
+            raise UsageError(f"{option}: expected a value behind it")
         if option == "--cfg" and value not in _CFG_VALUES:
             raise UsageError(f"--cfg: expected one of {', '.join(_CFG_VALUES)}, got {value!r}")
         if option == "--config-dir":
@@ -286,6 +288,10 @@ def _add_override(arguments: Arguments, word: str) -> None:
         raise UsageError(f"{word}: expected key=value")
     if key in GROUPS and (value == "null" or not _FILE_CHOICE.match(value)):  # no path out of the group's folder
         raise UsageError(f"{key}: expected the name of a file in configs/{key}, got {value!r}")
+    if "range(" in value:
+        from torchpt.cli.grammar import read_value
+
+        read_value(key, value)  # Hydra does nothing for no values, and does not count many
     arguments.overrides.append(word)
 
 

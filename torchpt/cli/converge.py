@@ -18,6 +18,7 @@ from torchpt.cli.notices import printed_scene_warnings
 from torchpt.cli.progress import Bar
 from torchpt.cli.streams import flushed_stdout
 from torchpt.core.errors import OutputError, SceneError
+from torchpt.core.files import written_path
 
 __all__ = ["HELP", "converge", "raw_study", "run"]
 
@@ -227,7 +228,7 @@ def _output_folder(out: str | None, name: str, identity: dict[str, Any]) -> tupl
     Raises:
         OutputError: the path is a file.
     """
-    first = Path(name if out is None else out).expanduser()
+    first = written_path(name if out is None else out, "out")
     if first.exists() and not first.is_dir():
         raise OutputError(first, "is a file; expected a folder")
     if not _holds_another(first, identity):

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from torchpt.cli import gc_pause
-from torchpt.cli.arguments import UsageError, is_scene_word
+from torchpt.cli.arguments import GROUPS, UsageError, is_scene_word
 from torchpt.cli.interrupt import Interrupt
 from torchpt.cli.notices import printed_scene_warnings
 from torchpt.cli.streams import flushed_stdout
@@ -83,6 +83,10 @@ def _parse(words: list[str]) -> tuple[str, Path, dict[str, Any]]:
             changes[key] = values[0]
         elif word.startswith("-"):
             raise UsageError(f"{word}: unknown option; known: --help")
+        elif word.partition(".")[0] in GROUPS and "=" in word:
+            raise UsageError(
+                f"{word}: settings of renders are no part of a scene that is converted; set them in a render"
+            )
         else:
             files.append(word)
     if len(files) != 2:

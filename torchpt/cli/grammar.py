@@ -66,6 +66,10 @@ def read_value(key: str, text: str) -> tuple[list[Any], bool]:
             )
     except HydraException as error:
         raise UsageError(f"{key}={text}: expected key=value ({parse_failure(error)})") from error
+    except (ArithmeticError, ValueError) as error:  # a step of 0, NaN
+        raise UsageError(f"{key}: expected values a,b or choice(a,b) or range(a,b), got {text!r}") from error
+    if not values:
+        raise UsageError(f"{key}: expected at least one value, got {text!r}")
     if len(values) > MAX_VALUES:
         raise UsageError(f"{key}: expected at most {MAX_VALUES} values, got {text!r}")
     for item in values:

@@ -68,6 +68,9 @@ def unknown_key_error(key: str, words: Iterable[str] = ()) -> str:
                 own = ", ".join(known_keys(group, kind))
                 owners = ", ".join(other for other in types(group) if name in known_keys(group, other))
                 return f"{key}: expected only keys of {group}={kind} ({own}); {name} belongs to {owners}"
+        outer = key.rpartition(".")[0]
+        if outer != group and any(word.startswith(f"{outer}=") for word in words):
+            return f"{key}: expected {outer}.type= beside it, or both as {outer}={{type: ..., {key.rpartition('.')[2]}: ...}}"
         if name in known_keys(group):
             how = f"+{key}= adds it, as does `defaults: [default]` there"
             return f"{key}: expected a key of the file of {group} that is chosen; {how}"

@@ -243,7 +243,7 @@ def _chosen_settings(composed: dict[Any, Any], words: list[str]) -> dict[str, di
     Raises:
         UsageError: an unknown block, or a key ``_target_``.
     """
-    unset = {word.lstrip("+").removesuffix("=null") for word in words if word.endswith("=null")}
+    unset = _keys_set_to_null(words)
     _refuse_targets(composed, "")
     given: dict[str, dict[str, Any]] = {}
     for group, block in composed.items():
@@ -253,16 +253,40 @@ def _chosen_settings(composed: dict[Any, Any], words: list[str]) -> dict[str, di
             continue
         if not isinstance(block, dict):
             raise UsageError(f"{group}: expected a file of configs/{group} or keys below it, got {block!r}")
-        kept = {key: _without_nulls(value) for key, value in block.items()}
-        given[group] = {key: value for key, value in kept.items() if value is not None or f"{group}.{key}" in unset}
+        given[group] = _without_nulls(block, group, unset) or {}
     return given
 
 
-def _without_nulls(value: Any) -> Any:
-    """Return a nested block without its nulls, or None if nothing is left."""
+def _keys_set_to_null(words: list[str]) -> set[str]:
+    """Return the dotted keys that words set to null, in the spellings of Hydra's grammar and within mappings."""
+    found: set[str] = set()
+    for word in words:
+        key, _, text = word.lstrip("+").partition("=")
+        if text.strip().lower() == "null":
+            found.add(key)
+        elif text.lstrip().startswith("{") and "null" in text.lower():
+            from torchpt.cli.grammar import read_value
+
+            (value, *_), _ = read_value(key, text)
+            found |= set(_nulls_within(value, key))
+    return found
+
+
+def _nulls_within(value: Any, key: str) -> Iterator[str]:
+    """Yield the dotted keys of the nulls in nested mappings."""
+    if value is None:
+        yield key
+    elif isinstance(value, dict):
+        for name, item in value.items():
+            yield from _nulls_within(item, f"{key}.{name}")
+
+
+def _without_nulls(value: Any, key: str, unset: set[str]) -> Any:
+    """Return a nested block without its nulls, but for those of keys that are ``unset``; None if nothing is left."""
     if not isinstance(value, dict):
         return value
-    return {key: item for key, item in value.items() if item is not None} or None
+    kept = {name: _without_nulls(item, f"{key}.{name}", unset) for name, item in value.items()}
+    return {name: item for name, item in kept.items() if item is not None or f"{key}.{name}" in unset} or None
 
 
 def _refuse_targets(value: Any, where: str) -> None:

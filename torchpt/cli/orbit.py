@@ -26,6 +26,7 @@ from torchpt.cli.render import Job, check_distinct, numbered, plain, scene_and_s
 from torchpt.cli.streams import flushed_stdout
 from torchpt.cli.sweep_table import record_job
 from torchpt.core.errors import OutputError, SceneError
+from torchpt.core.files import written_path
 from torchpt.core.version import __version__
 
 if TYPE_CHECKING:
@@ -88,8 +89,8 @@ class Turn:
         # Of each key: type, what is accepted in words, and the test, which NaN fails.
         for key, kind, expected, accept in (
             ("frames", int, f"a whole number 1..{_MOST_FRAMES}", lambda x: 1 <= x <= _MOST_FRAMES),
-            ("degrees", float, "an angle in degrees", lambda x: abs(x) <= 1e6),
-            ("fps", float, "a number above 0", lambda x: 1e-2 <= x <= 1e3),
+            ("degrees", float, "an angle in degrees, at most 1e6 either way", lambda x: abs(x) <= 1e6),
+            ("fps", float, "a number 0.01..1000", lambda x: 1e-2 <= x <= 1e3),
         ):
             if key in words:
                 try:
@@ -211,7 +212,7 @@ def _outputs(job: Job) -> list[str]:
     """Return the movies to write; in a sweep their names have the job's number."""
     path = Path(job.scene)
     name = path.stem if path.suffix in (".yaml", ".yml", ".xml") else path.name
-    return [numbered(str(Path(out).expanduser()), job.number) for out in job.outs or (f"{name}.gif",)]
+    return [numbered(str(written_path(out, "out")), job.number) for out in job.outs or (f"{name}.gif",)]
 
 
 def _render_missing_frames(job: Job, scene: Scene, turn: Turn, frames: Frames, interrupt: Interrupt) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from torchpt.cli.progress import Bar
 from torchpt.cli.streams import flushed_stdout
 from torchpt.cli.sweep_table import error_of, record_job, two_digits
 from torchpt.core.errors import OutputError, RenderError, SceneError, TorchptError
+from torchpt.core.files import written_path
 
 __all__ = [
     "HELP",
@@ -134,12 +135,14 @@ def render(job: Job, interrupt: Interrupt) -> int:
         description, settings = scene_and_settings(job)
         settings = with_error_pilots(settings)
         outs = _outputs(job, settings)
-        preview = settings.render.preview and numbered(str(Path(settings.render.preview).expanduser()), job.number)
+        preview = settings.render.preview and numbered(
+            str(written_path(settings.render.preview, "render.preview")), job.number
+        )
         previews = _preview_files(preview) if preview else []
         denoised = _denoised_files(settings, outs)
         checkpoint = settings.render.checkpoint
         if checkpoint:
-            checkpoint = numbered(str(Path(checkpoint).expanduser()), job.number)
+            checkpoint = numbered(str(written_path(checkpoint, "render.checkpoint")), job.number)
         check_distinct(
             [
                 *(("out", path) for path in outs),
@@ -194,7 +197,8 @@ def render(job: Job, interrupt: Interrupt) -> int:
     record_job(job, summary)  # for the table of a sweep; nothing outside one
     if interrupt.signum is None:
         return 0
-    resume_hint = "" if settings.render.checkpoint is None else "; render.resume=true goes on"
+    resumable = settings.render.checkpoint is not None and Path(settings.render.checkpoint).exists()
+    resume_hint = "; render.resume=true goes on from the last checkpoint" if resumable else ""
     print(f"torchpt: stopped by a signal; {outs[0]} holds the picture so far{resume_hint}", file=sys.stderr)
     return Interrupted(interrupt.signum).exit_code
 
@@ -237,7 +241,7 @@ def _outputs(job: Job, settings: Any) -> list[str]:
     Layers that only the scene file asks for are left out in other formats.
     """
     layers = list(settings.film.aovs or ())
-    outs = [str(Path(path).expanduser()) for path in job.outs]
+    outs = [str(written_path(path, "out")) for path in job.outs]
     if not outs:
         outs = [_scene_name(job.scene) + (".exr" if layers else ".png")]
     if layers and "aovs" in job.overrides.get("film", {}) and not any(_is_exr(path) for path in outs):

@@ -15,6 +15,7 @@ from torchpt.cli.arguments import GROUPS, UsageError, is_scene_word
 from torchpt.cli.interrupt import Interrupt
 from torchpt.cli.streams import flushed_stdout
 from torchpt.core.errors import OutputError, SceneError
+from torchpt.core.files import written_path
 
 if TYPE_CHECKING:
     from torchpt.stress import Case, Harness, Outcome
@@ -98,6 +99,12 @@ class StressOptions:
         if (found.settings or found.changes) and "scene" not in found.text_of_key:
             first = next(iter([*found.settings, *found.changes]))
             raise UsageError(f"{first}: settings are of a scene: expected scene= beside them")
+        for group in ("film", "render"):
+            for name, value in found.settings.get(group, {}).items():
+                raise UsageError(
+                    f"{group}.{name}: expected none of film and render, which `torchpt stress` sets itself, got {value!r}; "
+                    "accel= and compile= say what is compared"
+                )
         for key, accepted in _CHOICES.items():
             values = found.list(key, accepted[0])
             takes_one = key in ("dtype", "quick")
@@ -210,7 +217,7 @@ def _folder(options: StressOptions) -> Path | None:
     """Return the folder of ``out=``, which is made if it is missing; None without."""
     if "out" not in options.text_of_key:
         return None
-    folder = Path(options.text_of_key["out"]).expanduser()
+    folder = written_path(options.text_of_key["out"], "out")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -13,7 +13,16 @@ from typing import Any
 
 from torchpt.core.errors import SceneError
 
-__all__ = ["MAX_BYTES", "UnreadableFile", "as_path", "check_regular", "configs", "is_regular", "read_regular"]
+__all__ = [
+    "MAX_BYTES",
+    "UnreadableFile",
+    "as_path",
+    "check_regular",
+    "configs",
+    "is_regular",
+    "read_regular",
+    "written_path",
+]
 
 #: Size limit of mesh and picture files in bytes.
 MAX_BYTES = 4 * 2**30
@@ -36,6 +45,18 @@ def as_path(path: Any) -> Path:
     if not isinstance(text, str):  # a PathLike may return bytes
         raise SceneError("path", path, "a file's path, as text or a pathlib.Path")
     return Path(text)
+
+
+def written_path(path: str, key: str) -> Path:
+    """Return the path of a file to write, with a home folder in place of ``~``.
+
+    Raises:
+        SceneError: a user of whom no home folder is known; ``key`` is that of the path.
+    """
+    try:
+        return Path(path).expanduser()
+    except RuntimeError:
+        raise SceneError(key, path, "a path, without ~ or with one of a user who has a home folder here") from None
 
 
 def is_regular(path: str | os.PathLike[str]) -> bool:

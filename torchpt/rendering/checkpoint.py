@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from torchpt.core.errors import AssetError, OutputError
-from torchpt.core.files import check_regular
+from torchpt.core.files import check_regular, written_path
 from torchpt.core.tree import fingerprint
 from torchpt.core.version import __version__
 from torchpt.images.write import check_writable, output_path, temporary_beside, write_error
@@ -171,7 +171,7 @@ class CheckpointFile:
     """
 
     def __init__(self, path: str, render_identity: Mapping[str, Any] | None = None) -> None:
-        self.path, self.seconds = Path(path).expanduser(), 0.0
+        self.path, self.seconds = written_path(str(path), "render.checkpoint"), 0.0
         self._identity = dict(render_identity or {})
         self._last_write_at, self._last_write_seconds = time.perf_counter(), 0.0
 

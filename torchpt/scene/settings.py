@@ -738,19 +738,28 @@ def _merge(
             blame = None if _contains(overrides, error.key) else file  # the file is at fault only for its own keys
             raise type(error)(error.key, error.value, error.expected, blame) from None
     settings = Settings(**blocks)
-    _check_pilots(settings, file)
-    if not settings.integrator.light:
-        if settings.film.denoise:
-            expected = f"false where integrator is {settings.integrator.name} (it carries no light)"
-            raise SceneError("film.denoise", True, expected, None if _contains(overrides, "film.denoise") else file)
-        for name in settings.film.aovs:
-            if LAYERS[name].light:
-                expected = f"no {name} where integrator is {settings.integrator.name} (it carries no light)"
-                raise SceneError("film.aovs", list(settings.film.aovs), expected, file)
+    try:
+        _check_together(settings)
+    except SceneError as error:
+        blame = None if _contains(overrides, error.key) else file
+        raise type(error)(error.key, error.value, error.expected, blame) from None
     return settings
 
 
-def _check_pilots(settings: Settings, file: str | None) -> None:
+def _check_together(settings: Settings) -> None:
+    """Raise where settings exclude one another."""
+    _check_pilots(settings)
+    if not settings.integrator.light:
+        if settings.film.denoise:
+            expected = f"false where integrator is {settings.integrator.name} (it carries no light)"
+            raise SceneError("film.denoise", True, expected)
+        for name in settings.film.aovs:
+            if LAYERS[name].light:
+                expected = f"no {name} where integrator is {settings.integrator.name} (it carries no light)"
+                raise SceneError("film.aovs", list(settings.film.aovs), expected)
+
+
+def _check_pilots(settings: Settings) -> None:
     """Raise where settings need error probes that other settings exclude, or probes are redundant."""
     film, render = settings.film, settings.render
     adaptive, variance = settings.adaptive, "variance" in film.aovs
@@ -759,18 +768,18 @@ def _check_pilots(settings: Settings, file: str | None) -> None:
             continue
         value = render.target_error if key.startswith("render") else adaptive
         if render.pilots is False:
-            raise SceneError("render.pilots", False, f"auto or true beside {key}", file)
+            raise SceneError("render.pilots", False, f"auto or true beside {key}")
         if not settings.integrator.light:
             expected = f"an integrator that carries light, not {settings.integrator.name}"
-            raise SceneError(key, value, expected, file)
+            raise SceneError(key, value, expected)
         if settings.integrator.splats:
             expected = f"an integrator whose samples light their own pixels alone, not {settings.integrator.name}"
-            raise SceneError(key, value, expected, file)
+            raise SceneError(key, value, expected)
         if variance:
-            raise SceneError("film.aovs", list(film.aovs), f"no variance beside {key}", file)
+            raise SceneError("film.aovs", list(film.aovs), f"no variance beside {key}")
     if variance and render.pilots is True:
         expected = "auto or false where film.aovs asks for variance: every pixel is sampled by two streams then"
-        raise SceneError("render.pilots", True, expected, file)
+        raise SceneError("render.pilots", True, expected)
 
 
 def _check_stop_rules(raw: Mapping[str, Any], sampler: ParsedParams) -> None:
@@ -788,6 +797,8 @@ def _contains(overrides: Mapping[str, Any], key: str) -> bool:
     """Return True where the overrides contain the key of an error."""
     value: Any = overrides
     for part in key.split(".")[:3]:  # deeper parts of a key lie inside a single value
+        if isinstance(value, list | tuple):
+            return True
         if not isinstance(value, Mapping) or value.get(part) is None:
             return isinstance(value, str)  # a bare name stands for a block of that type
         value = value[part]

@@ -22,7 +22,10 @@ from torch import Tensor
 
 from torchpt.spec import Spec
 
-__all__ = ["Filter", "Tabulated"]
+__all__ = ["MAX_WIDTH", "Filter", "Tabulated"]
+
+#: Widest filters in pixels, that tables of them are fine enough.
+MAX_WIDTH = 1000.0
 
 
 # ---- The base class

@@ -335,13 +335,20 @@ def overridden(description: Description, overrides: Mapping[str, Mapping[str, An
         SceneError: key such as ``render.spp``.
     """
     for block, changes in overrides.items():
-        kept = {
-            key: value
-            for key, value in getattr(description, block).items()
-            if key not in changes or changes[key] is not None
-        }
-        description = replace(description, **{block: kept})
+        description = replace(description, **{block: _without_removed(getattr(description, block), changes)})
     return description, settings(description, overrides)
+
+
+def _without_removed(block: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a block without the keys that are null among the changes, also in blocks within."""
+    kept: dict[str, Any] = {}
+    for key, value in block.items():
+        change = changes.get(key)
+        if isinstance(value, Mapping) and isinstance(change, Mapping):
+            kept[key] = _without_removed(value, change)
+        elif key not in changes or change is not None:
+            kept[key] = value
+    return kept
 
 
 def _describe(

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from torchpt.physics.film.filters import Tabulated
+from torchpt.physics.film.filters import MAX_WIDTH, Tabulated
 from torchpt.spec import Scalar
 
 __all__ = ["Gaussian"]
@@ -18,9 +18,12 @@ class Gaussian(Tabulated):
 
     name = "gaussian"
     parameters: ClassVar = {
-        "stddev": Scalar(0.5, above=0.0, doc="standard deviation in pixels"),
+        "stddev": Scalar(0.5, above=0.0, high=MAX_WIDTH, doc="standard deviation in pixels"),
         "radius": Scalar(
-            lambda values: 4.0 * values["stddev"], above=0.0, doc="half width in pixels; 4 `stddev` by default"
+            lambda values: 4.0 * values["stddev"],
+            above=0.0,
+            high=4.0 * MAX_WIDTH,
+            doc="half width in pixels; 4 `stddev` by default",
         ),
     }
 

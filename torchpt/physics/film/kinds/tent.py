@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchpt.physics.film.filters import Filter
+from torchpt.physics.film.filters import MAX_WIDTH, Filter
 from torchpt.spec import Scalar
 
 __all__ = ["Tent"]
@@ -19,7 +19,7 @@ class Tent(Filter):
     """A triangle, as in Mitsuba."""
 
     name = "tent"
-    parameters: ClassVar = {"radius": Scalar(1.0, above=0.0, doc="half width in pixels")}
+    parameters: ClassVar = {"radius": Scalar(1.0, above=0.0, high=MAX_WIDTH, doc="half width in pixels")}
 
     def half_width(self) -> float:
         """Return the radius in pixels: the parameter ``radius``."""
