@@ -6,6 +6,7 @@ values that are not tensors.
 
 from __future__ import annotations
 
+import atexit
 import base64
 import json
 import threading
@@ -26,7 +27,17 @@ from torchpt.compiler.target import Target
 from torchpt.native import cache
 from torchpt.native.content import code_of_folder
 
-__all__ = ["MOST_PROGRAMS", "cache_key", "clear_programs", "compile_stage", "load", "prefetch", "program_of", "store"]
+__all__ = [
+    "MOST_PROGRAMS",
+    "cache_key",
+    "clear_programs",
+    "compile_stage",
+    "load",
+    "note_unasked",
+    "prefetch",
+    "program_of",
+    "store",
+]
 
 
 # ---- Programs on disk: the result of tracing, so that another process need not trace the stage again
@@ -197,8 +208,8 @@ MOST_PROGRAMS = 512
 _programs: dict[Any, Program] = {}
 #: Most programs that are begun and not asked for yet.
 MOST_BEGUN = 64
-#: Programs without their functions, and the IR of these, which other processes compile; by structure and target.
-_begun: dict[Any, tuple[Program, str]] = {}
+#: Programs without their functions, the IR of these, which other processes compile, and keys on disk; by structure and target.
+_begun: dict[Any, tuple[Program, str, str]] = {}
 _tracing = threading.Lock()
 
 
@@ -226,7 +237,7 @@ def program_of(
         if program is None and disk_key is not None:
             program = load(disk_key, target)
         if program is None and key in _begun:
-            begun, ir = _begun.pop(key)
+            begun, ir, _ = _begun.pop(key)
             program = replace(begun, function=cpu.compile_ir(ir, target))
             if disk_key is not None:
                 store(disk_key, program)
@@ -273,10 +284,22 @@ def prefetch(
         if program is not None:
             _keep(key, program)
             return
+        if cache.read(f"{disk_key}.unasked") is not None:
+            return
         stage = trace()
         ir = kernel_ir(stage, (target or cpu.host()).form)
         if cpu.begin(ir, target):
-            _begun[key] = Program.of(stage, cpu.NOT_COMPILED), ir
+            _begun[key] = Program.of(stage, cpu.NOT_COMPILED), ir, disk_key
+
+
+@atexit.register
+def note_unasked() -> None:
+    """Note on disk which programs were begun and never asked for, so that later processes do not trace them in vain.
+
+    They are of models that no path hits, in scenes of this structure.
+    """
+    for _, _, disk_key in _begun.values():
+        cache.write(f"{disk_key}.unasked", b"")
 
 
 def compile_stage(stage: TracedStage, target: Target | None = None) -> Program:

@@ -33,7 +33,7 @@ _CHECKSUM_BYTES = 32
 _UNFINISHED = "unfinished-"
 #: Names of files that this module may remove, since the folder may hold other files, such as the results of
 #: device checks, which are few and stay. Earlier versions wrote ``.nbc``.
-_OURS = re.compile(rf"[0-9a-f]{{{_KEY_DIGITS}}}\.(o|json|nbc|ptx|quick)|{_UNFINISHED}.*")
+_OURS = re.compile(rf"[0-9a-f]{{{_KEY_DIGITS}}}\.(o|json|nbc|ptx|quick|unasked)|{_UNFINISHED}.*")
 
 
 def digest(*texts: str) -> str:
