@@ -90,6 +90,7 @@ CASES = [
     (["render", S, "film.filter=tent", "film.filter.radius=2"], "film.filter.radius: expected film.filter.type= beside it"),
     (["stress", S, "render.spp=9"], "render.spp: expected none of film and render, which `torchpt stress` sets itself"),
     (["convert", S[6:], "a.yaml", "film.width=3"], "film.width=3: settings of renders are no part of a scene"),
+    (["render", S, "film.width=65536", "film.height=1", "out=a.jpg"], "film.width: expected at most 65500 beside a.jpg"),
     (["render", S, "out=a"], "needs an ending"),
     (["render", S, "out=nowhere/a.png"], "there is no folder"),
     (["render", S, "out=[a.png,nowhere/b.png]"], "there is no folder"),

@@ -235,6 +235,10 @@ def _scene_name(scene: str) -> str:
     return path.stem if path.suffix in (".yaml", ".yml", ".xml") else path.name
 
 
+#: Longest side of a picture that libjpeg writes.
+_MOST_OF_JPEG = 65500
+
+
 def _outputs(job: Job, settings: Any) -> list[str]:
     """Return the files to write; refuse ``film.aovs`` of the command line if no file can hold layers.
 
@@ -244,6 +248,11 @@ def _outputs(job: Job, settings: Any) -> list[str]:
     outs = [str(written_path(path, "out")) for path in job.outs]
     if not outs:
         outs = [_scene_name(job.scene) + (".exr" if layers else ".png")]
+    for path in outs:
+        sides = settings.film.window[2:]
+        if Path(path).suffix.lower() in (".jpg", ".jpeg") and max(sides) > _MOST_OF_JPEG:
+            key = "film.width" if sides[0] > _MOST_OF_JPEG else "film.height"
+            raise SceneError(key, max(sides), f"at most {_MOST_OF_JPEG} beside {path} (more is no JPEG)")
     if layers and "aovs" in job.overrides.get("film", {}) and not any(_is_exr(path) for path in outs):
         raise SceneError("film.aovs", layers, "a picture ending in .exr among out= (no other format keeps layers)")
     return [numbered(path, job.number) for path in outs]
