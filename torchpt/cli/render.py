@@ -198,7 +198,7 @@ def render(job: Job, interrupt: Interrupt) -> int:
     if interrupt.signum is None:
         return 0
     resumable = settings.render.checkpoint is not None and Path(settings.render.checkpoint).exists()
-    resume_hint = "; render.resume=true goes on from the last checkpoint" if resumable else ""
+    resume_hint = "; render.resume=true goes on" if resumable else ""
     print(f"torchpt: stopped by a signal; {outs[0]} holds the picture so far{resume_hint}", file=sys.stderr)
     return Interrupted(interrupt.signum).exit_code
 
