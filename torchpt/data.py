@@ -134,7 +134,7 @@ class _ItemRenderer:
         params = {**(self.cameras[camera_index] if self.cameras else {}), **(options.pop("params", None) or {})}
         params = {
             name: _tensor(
-                f"params.{name}", value, scene.tensors[name].dtype if name in scene.tensors else torch.float32
+                f"params.{name}", value, scene.raw_params[name].dtype if name in scene.raw_params else torch.float32
             )
             for name, value in params.items()
         }
@@ -147,11 +147,11 @@ class _ItemRenderer:
     def _tensors(self, item: _Item, rendering: Rendering) -> dict[str, Tensor]:
         """Return picture, layers and camera of a rendered item."""
         scene, params = item.request.caller_scene, item.params
-        pose_dtype = scene.tensors["camera.to_world"].dtype  # float64 far from the origin
+        pose_dtype = scene.raw_params["camera.to_world"].dtype  # float64 far from the origin
         to_world = scene.merged(params)["camera.to_world"].to(pose_dtype)
         layers = {name: rendering.layers[name] for name in self.layers}
         found = {"image": rendering.image, **layers, "to_world": to_world}
-        if "camera.fov" in scene.tensors:
+        if "camera.fov" in scene.raw_params:
             camera = {name: value for name, value in params.items() if name.startswith("camera.")}
             matrices = scene.pinhole(camera, item.film, pose_dtype)
             found |= {"K": matrices.K, "R": matrices.R, "t": matrices.t}

@@ -206,6 +206,15 @@ def test_obj_of_many_small_groups_takes_no_time(tmp_path):
     assert time.process_time() - start < 2.0  # .5 s; 2.5 s before
 
 
+@pytest.mark.parametrize("channels", [3, 4])
+def test_mtl_takes_alpha_of_exr_files(tmp_path, channels):
+    torchpt.write_image(tmp_path / "t.exr", torch.full((2, 2, channels), 0.5))
+    (tmp_path / "a.mtl").write_text("newmtl a\nmap_Kd t.exr\nmap_d t.exr\n")
+    (tmp_path / "a.obj").write_text("mtllib a.mtl\nusemtl a\nv 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3\n")
+    opacity = only(tmp_path / "a.obj").material.material["opacity"]
+    assert opacity["channel"] == ("a" if channels == 4 else "luminance")
+
+
 @pytest.mark.parametrize("mode", ["RGB", "L", "RGBA"])
 def test_mtl_takes_alpha_where_there_is_some(tmp_path, mode):
     """`map_d` of the image of the colour: its alpha, or what it shows."""

@@ -9,8 +9,11 @@ import pytest
 import torch
 
 import torchpt
+from torchpt.gradients.edges.left_out import left_out
 from torchpt.images import PackedImages, Texels
 from torchpt.physics.textures.atlas import Atlas
+from torchpt.scene.fingerprint import fingerprints
+from torchpt.scene.formats.description import settings
 
 #: Bytes by number of channels.
 SIZES = {1: (5, 7), 2: (3, 4), 3: (6, 5), 4: (4, 3)}
@@ -126,7 +129,7 @@ def one():
     )
 
 
-NAME = "shapes.plate0.material.reflectance"
+NAME, ALPHA = "shapes.plate0.material.reflectance", "shapes.plate0.material.alpha"
 
 
 def test_changes_in_place_count():
@@ -155,7 +158,7 @@ def test_gradients_by_others_leave_images_packed(name):
     assert known.params
     grads = []
     for found in (loaded, known):
-        value = found.tensors[name].clone().requires_grad_()
+        value = found.raw_params[name].clone().requires_grad_()
         picture_of = torchpt.render(found, params={name: value})
         grads.append(torch.autograd.grad(picture_of.square().sum(), value)[0])
     assert torch.equal(*grads) and loaded._packed.found() and grads[0].abs().sum() > 0
@@ -229,3 +232,32 @@ def test_an_image_of_colours_and_numbers():
 def test_values_that_a_slot_does_not_accept():
     with pytest.raises(torchpt.SceneError, match=r"numbers in 0\.\.1 in the texels"):
         torchpt.load(scene({"type": "diffuse", "reflectance": image(3, scale=2.0)}))
+
+
+def test_what_is_left_out_of_edges_reads_numbers():
+    """A rough conductor is no mirror while its roughness waits in an image, and keeps it there."""
+    rough = {"type": "roughconductor", "alpha": {"type": "image", "data": np.full((6, 5, 1), 128, np.uint8)}}
+    loaded = torchpt.load(scene(rough))
+    assert not any("mirrors" in name for name in left_out(loaded, settings(loaded.description, {})))
+    assert loaded._packed.found() and torch.equal(loaded.readable_params()[ALPHA], loaded.params[ALPHA])
+
+
+def test_maps_of_normals_leave_images_packed():
+    loaded = torchpt.load(scene({"type": "diffuse", "reflectance": image(3), "normal_map": image(3, 3)}))
+    radiance = torch.ones(3, requires_grad=True)
+    torchpt.render(loaded, params={"lights.sky.radiance": radiance}).mean().backward()
+    fingerprints(loaded)
+    assert loaded._packed.found()
+
+
+def test_only_what_is_read_packed_is_packed():
+    loaded = torchpt.load(scene(*MATERIALS["filtered"]))
+    assert list(loaded._packed.found()) == ["shapes.plate1.material.reflectance"]
+
+
+def test_parameters_may_be_assigned():
+    loaded = one()
+    loaded.params |= {NAME: torch.full((6, 5, 3), 0.25)}
+    assert float(loaded.params[NAME].max()) == 0.25
+    loaded.params = dict(one().params)
+    assert torch.equal(torchpt.render(loaded), torchpt.render(one()))

@@ -222,7 +222,7 @@ def _render_missing_frames(job: Job, scene: Scene, turn: Turn, frames: Frames, i
     from torchpt.rendering.api import render_scene
     from torchpt.scene.formats.description import settings
 
-    own_pose, seed = scene.tensors["camera.to_world"], settings(scene.description, job.overrides).render.seed
+    own_pose, seed = scene.raw_params["camera.to_world"], settings(scene.description, job.overrides).render.seed
     totals: dict[str, int] = {"rays": 0, "nonfinite_samples": 0}
     causes: Counter[str] = Counter()
     begun = time.perf_counter()
@@ -243,7 +243,7 @@ def _render_missing_frames(job: Job, scene: Scene, turn: Turn, frames: Frames, i
             # In a scene file these settings are meant for `torchpt render`.
             film, render = run_settings.film.but(denoise=False), run_settings.render.but(checkpoint=None, resume=False)
             run_settings = replace(run_settings, film=film, render=render)
-            scene.take({"camera.to_world": torch.from_numpy(pose.copy()).to(own_pose)})
+            scene.replace_params({"camera.to_world": torch.from_numpy(pose.copy()).to(own_pose)})
             rendering = render_scene(scene, run_settings, on_progress=partial(on_progress, number, totals["rays"]))
             if not rendering.complete:
                 break

@@ -151,6 +151,7 @@ def render(job: Job, interrupt: Interrupt) -> int:
                 *(("film.denoise", path) for path in denoised),
             ]
         )
+        _check_jpeg([*outs, *previews, *denoised], settings)
         for path in (*outs, *previews, *denoised) if writes_files else ():
             check_writable(path)
         if checkpoint is not None:
@@ -236,7 +237,20 @@ def _scene_name(scene: str) -> str:
 
 
 #: Longest side of a picture that libjpeg writes.
-_MOST_OF_JPEG = 65500
+_LONGEST_JPEG = 65500
+
+
+def _check_jpeg(paths: Sequence[str], settings: Any) -> None:
+    """Check that pictures are small enough for files that are JPEG.
+
+    Raises:
+        SceneError: one is not.
+    """
+    width, height = settings.film.window[2:]
+    for path in paths:
+        if Path(path).suffix.lower() in (".jpg", ".jpeg") and max(width, height) > _LONGEST_JPEG:
+            key = "film.width" if width > _LONGEST_JPEG else "film.height"
+            raise SceneError(key, max(width, height), f"at most {_LONGEST_JPEG} beside {path} (more is no JPEG)")
 
 
 def _outputs(job: Job, settings: Any) -> list[str]:
@@ -248,11 +262,6 @@ def _outputs(job: Job, settings: Any) -> list[str]:
     outs = [str(written_path(path, "out")) for path in job.outs]
     if not outs:
         outs = [_scene_name(job.scene) + (".exr" if layers else ".png")]
-    for path in outs:
-        sides = settings.film.window[2:]
-        if Path(path).suffix.lower() in (".jpg", ".jpeg") and max(sides) > _MOST_OF_JPEG:
-            key = "film.width" if sides[0] > _MOST_OF_JPEG else "film.height"
-            raise SceneError(key, max(sides), f"at most {_MOST_OF_JPEG} beside {path} (more is no JPEG)")
     if layers and "aovs" in job.overrides.get("film", {}) and not any(_is_exr(path) for path in outs):
         raise SceneError("film.aovs", layers, "a picture ending in .exr among out= (no other format keeps layers)")
     return [numbered(path, job.number) for path in outs]

@@ -6,7 +6,6 @@ values that are not tensors.
 
 from __future__ import annotations
 
-import atexit
 import base64
 import json
 import threading
@@ -210,6 +209,8 @@ _programs: dict[Any, Program] = {}
 MOST_BEGUN = 64
 #: Programs without their functions, the IR of these, which other processes compile, and keys on disk; by structure and target.
 _begun: dict[Any, tuple[Program, str, str]] = {}
+#: Keys on disk of those that :func:`note_unasked` has noted.
+_noted: set[str] = set()
 _tracing = threading.Lock()
 
 
@@ -292,14 +293,16 @@ def prefetch(
             _begun[key] = Program.of(stage, cpu.NOT_COMPILED), ir, disk_key
 
 
-@atexit.register
 def note_unasked() -> None:
-    """Note on disk which programs were begun and never asked for, so that later processes do not trace them in vain.
+    """Note on disk which programs were begun and not asked for by a render that is complete.
 
-    They are of models that no path hits, in scenes of this structure.
+    They are of models that no or few paths hit, in scenes of this structure. Later processes do not trace them in vain.
     """
-    for _, _, disk_key in _begun.values():
-        cache.write(f"{disk_key}.unasked", b"")
+    with _tracing:
+        for _, _, disk_key in _begun.values():
+            if disk_key not in _noted:
+                _noted.add(disk_key)
+                cache.write(f"{disk_key}.unasked", b"")
 
 
 def compile_stage(stage: TracedStage, target: Target | None = None) -> Program:

@@ -51,8 +51,9 @@ def attached(scene: Scene, names: Iterable[str]) -> bool:
     # Materials with smooth refraction: their index of refraction sets the direction of the refracted ray.
     turned = {f"{material.name}." for material in materials if material.refracts_as_delta}
     # Mirrors and smooth coats: maps of their normals set the direction of the reflected ray.
+    params = scene.readable_params()
     for material in materials:
-        if (material.normal_map is not None or material.bump_map is not None) and is_mirror(material, scene.params):
+        if (material.normal_map is not None or material.bump_map is not None) and is_mirror(material, params):
             turned |= {f"{material.name}.{name}" for name in _MAPS}
 
     def is_attached(name: str) -> bool:

@@ -1,6 +1,6 @@
 """Images of 8 bits a value that stay so in memory: a texel is one number of 32 bits, decoded where it is read.
 
-A texture of such an image takes a third of the memory of its numbers in float32. These have their place all the same, as a
+A texel takes 4 bytes, where a colour in float32 takes 12. The numbers have their place all the same, as a
 tensor that anyone may ask for, but nothing is written there, and so no memory is taken, before someone does.
 """
 
@@ -37,6 +37,7 @@ class PackedTexels:
         channels: C, from 1 to 4.
         encoded: True: colours are decoded from sRGB. The last of 2 or 4 channels, alpha, is not.
         stored: ``(H, W, C)`` uint8, the same memory.
+        has_numbers: True: the tensor of the image has its numbers too.
     """
 
     words: Tensor
@@ -46,6 +47,7 @@ class PackedTexels:
     channels: int
     encoded: bool
     stored: NDArray[np.uint8]
+    has_numbers: bool
 
     def values(self) -> NDArray[np.float32]:
         """Return the texels ``(H, W, C)``, decoded."""
@@ -76,7 +78,9 @@ class PackedImages:
             for k in range(channels):  # one by one: several times faster than texel by texel
                 bytes_of[first : first + sizes[name], k] = image.stored[..., k].reshape(-1)
             stored = bytes_of[first : first + sizes[name], :channels].reshape(height, width, channels)
-            self._found[name] = PackedTexels(words, first, height, width, channels, image.encoded, stored)
+            self._found[name] = PackedTexels(
+                words, first, height, width, channels, image.encoded, stored, has_numbers=name not in tensors
+            )
             first += sizes[name]
         self._arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
         self._lock, self.pending = threading.Lock(), bool(images)

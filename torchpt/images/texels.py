@@ -120,11 +120,13 @@ class ByteImage:
         stored: ``(H, W, C)`` uint8.
         encoded: True: colours are decoded from sRGB. The last of 2 or 4 channels, alpha, is not.
         needs_floats: True: someone reads the values in another way than texel by texel.
+        is_read_packed: True: someone reads them so.
     """
 
     stored: NDArray[np.uint8]
     encoded: bool
     needs_floats: bool = False
+    is_read_packed: bool = False
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -241,11 +243,16 @@ def check_source(values: Mapping[str, Any]) -> None:
 
 
 def has_alpha(source: str | PathLike[str] | EncodedImage) -> bool:
-    """Return True for a PNG with an alpha channel or a transparent colour, and for a TGA with one; False for any other file."""
+    """Return True for a PNG, TGA or EXR file with alpha (also a PNG with a transparent colour); False for any other."""
     try:
         data = source.data if isinstance(source, EncodedImage) else read_regular(source)
     except OSError:
         return False
+    if data.startswith(b"\x76\x2f\x31\x01") and not isinstance(source, EncodedImage):
+        import OpenImageIO as oiio
+
+        picture = oiio.ImageInput.open(str(source))
+        return picture is not None and "A" in picture.spec().channelnames
     if not data.startswith(b"\x89PNG\r\n\x1a\n"):
         name = f".{source.kind}" if isinstance(source, EncodedImage) else str(source)
         # Bytes 2 and 16 of a TGA: the kind, here grey, and bits a pixel.

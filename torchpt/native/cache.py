@@ -2,8 +2,9 @@
 
 An entry is a file. Its name is a digest of the code that it was compiled from, so all checkouts and processes of a user share
 the folder. Its suffix says what it holds: ``.o`` object code, ``.quick`` quick code and its IR, ``.ptx`` code for a GPU,
-``.json`` digests of source files (:mod:`torchpt.native.content`) or checks of a GPU. Entries are executed, so only the user
-may access the folder (mode 0700, owner checked), and each entry has a checksum. Without such a folder nothing is cached.
+``.json`` digests of source files (:mod:`torchpt.native.content`) or checks of a GPU; ``.unasked`` says that a program was
+begun and not needed. Entries are executed, so only the user may access the folder (mode 0700, owner checked), and each entry
+has a checksum. Without such a folder nothing is cached.
 """
 
 from __future__ import annotations

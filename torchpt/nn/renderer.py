@@ -266,4 +266,4 @@ def _matching_names(scene: Scene, names: str | Sequence[str]) -> tuple[str, ...]
         if not names:
             raise SceneError("names", [], "one name at least, or None for a module without parameters")
     matched = frozenset(matching_names(scene, names))
-    return tuple(name for name in scene.tensors if name in matched)
+    return tuple(name for name in scene.raw_params if name in matched)

@@ -96,7 +96,7 @@ def _in_graph(
         return outside(scene, params=params, full=full, seed=seed, dtype=dtype, **options)
     given = dict(params) if params is not None else {}
     if torch.is_grad_enabled():
-        for name, value in scene.tensors.items():
+        for name, value in scene.raw_params.items():
             if value.requires_grad and name not in given:
                 given[name] = value
     differentiated = [name for name in given if given[name].requires_grad]

@@ -276,17 +276,17 @@ def _parameters(scene: Scene, params: Params | None, full: bool) -> dict[str, Te
     given: dict[Any, Any] = dict(params or {})
     for name in given:
         if not isinstance(name, str):
-            raise SceneError("params", name, f"names of scene.params such as {next(iter(scene.tensors))}")
+            raise SceneError("params", name, f"names of scene.params such as {next(iter(scene.raw_params))}")
     given = params_as_tensors(scene, given)
     if any(
-        name not in scene.tensors or not isinstance(value, Tensor) or value.is_meta for name, value in given.items()
+        name not in scene.raw_params or not isinstance(value, Tensor) or value.is_meta for name, value in given.items()
     ):
         scene.check(given)
     if full and any(is_batched(value) for value in given.values()):
         raise SceneError("full", True, "False under torch.func.vmap, where a render gives pictures alone")
     if not torch.is_grad_enabled():
         return given
-    return {name: value for name, value in scene.tensors.items() if getattr(value, "requires_grad", False)} | given
+    return {name: value for name, value in scene.raw_params.items() if getattr(value, "requires_grad", False)} | given
 
 
 def _without_aovs(settings: Settings, film: Mapping[str, Any] | None) -> Settings:

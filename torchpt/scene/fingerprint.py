@@ -36,7 +36,7 @@ def fingerprints(scene: Scene, params: Mapping[str, Tensor] | None = None) -> di
     Raises:
         SceneError: a BSDF of the caller with an attribute that cannot be hashed.
     """
-    tensors = {**scene.params, **(params or {})}
+    tensors = {**scene.readable_params(), **(params or {})}
     parts: dict[str, Any] = {"camera": [scene.description.camera]}
     for name in sorted(tensors):
         parts.setdefault(name.partition(".")[0], []).append((name, tensors[name]))

@@ -79,6 +79,6 @@ def _load(
             vertex_params=vertex_attributes_in(tensors),
         )
     # So that gradients reach the caller's tensors, and not only the numbers read from them.
-    scene.take(params_from_tensors(tensors, scene.description, scene.built, scene.tensors))
+    scene.replace_params(params_from_tensors(tensors, scene.description, scene.built, scene.raw_params))
     scene.load_seconds = time.perf_counter() - start
     return scene

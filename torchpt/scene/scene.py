@@ -84,6 +84,7 @@ class Scene:
         description: the validated scene file.
         device: device of the parameters.
         own_models: BSDFs of the caller.
+        params: every tensor by dotted name.
         load_seconds: seconds of loading, files included; 0 where it was not measured.
     """
 
@@ -122,7 +123,7 @@ class Scene:
                 with np.errstate(over="ignore"):  # infinite in float32: the check of the world says so
                     tensor = torch.from_numpy(value.astype(np.float64 if positions else np.float32, order="C"))
             self._tensors[name] = tensor.to(device)
-        packed = images if unread else {}
+        packed = {name: image for name, image in images.items() if unread and image.is_read_packed}
         self._packed = PackedImages(packed, {name: self._tensors[name] for name in unread})
         del images, packed
         trim_heap()  # of files as they were read
@@ -178,19 +179,29 @@ class Scene:
             unpack()
         return self._tensors
 
-    def _unpack(self) -> None:
-        if self._packed.unpack():
-            self._pieces.clear()  # those of packed images
+    @params.setter
+    def params(self, params: dict[str, Tensor]) -> None:
+        _ = self.params  # no tensor waits for its numbers any more
+        self._tensors = params
 
-    def take(self, params: Mapping[str, Tensor]) -> None:
+    def _unpack(self) -> None:
+        with self._lock:  # after a world that is being made of packed images
+            if self._packed.unpack():
+                self._pieces.clear()  # those of packed images
+
+    def replace_params(self, params: Mapping[str, Tensor]) -> None:
         """Take tensors in place of parameters, which are those of :attr:`params` from now on."""
         known = self._tensors if self._packed.found().keys().isdisjoint(params) else self.params
         known.update(params)
 
     @property
-    def tensors(self) -> Mapping[str, Tensor]:
-        """Return :attr:`params` for names, shapes and versions: images may not be decoded yet."""
+    def raw_params(self) -> Mapping[str, Tensor]:
+        """Return :attr:`params` for names, shapes and versions: where images are not decoded yet, numbers are arbitrary."""
         return self._tensors
+
+    def readable_params(self, params: Mapping[str, Tensor] | None = None) -> Mapping[str, Tensor]:
+        """Return :meth:`merged`; images that are not decoded yet are so where they are looked up, and stay as they are."""
+        return ParameterReads(self.merged(params), packed=self._packed.found())
 
     @property
     def origin(self) -> Scene:
@@ -363,7 +374,8 @@ class Scene:
     def merged(self, params: Mapping[str, Tensor] | None) -> dict[str, Tensor]:
         """Return all parameters, with those of ``params`` (checked before) in place of the scene's.
 
-        Poses of shapes whose sizes have changed (:mod:`torchpt.scene.sizes`) are those of their primitives.
+        Poses of shapes whose sizes have changed (:mod:`torchpt.scene.sizes`) are those of their primitives. Images are those of
+        :attr:`raw_params`; :meth:`readable_params` has their numbers.
         """
         merged = {**self._tensors, **{name: value.to(self.device) for name, value in (params or {}).items()}}
         # Autograd refuses tensors of torch.inference_mode, but not their clones.

@@ -31,9 +31,9 @@ def matching_names(scene: Scene, names: str | Sequence[str], key: str = "names")
     for name in names:
         if not isinstance(name, str):
             raise SceneError(key, name, "a name of scene.params or a pattern of some, as text")
-        matches = [parameter for parameter in scene.tensors if parameter == name or _matches(scene, parameter, name)]
+        matches = [parameter for parameter in scene.raw_params if parameter == name or _matches(scene, parameter, name)]
         if not matches:
-            examples = example_names(name, list(scene.tensors))
+            examples = example_names(name, list(scene.raw_params))
             raise SceneError(key, name, f"a parameter of this scene or a pattern of some, such as {examples}")
         matched |= dict.fromkeys(matches)
     return tuple(matched)

@@ -70,7 +70,7 @@ def _texels(scene: Scene, params: Mapping[str, Tensor]) -> dict[str, Tensor]:
     loaded = scene.built.parameters
     return {
         name: _detached(value, loaded[name])
-        for name, value in {**scene.tensors, **params}.items()
+        for name, value in {**scene.raw_params, **params}.items()
         if name in loaded and _is_texels(value, loaded[name].ndim)
     }
 

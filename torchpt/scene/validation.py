@@ -56,11 +56,13 @@ def params_as_tensors(scene: Scene, params: Mapping[str, Any]) -> dict[str, Any]
     A number stands for three equal channels of a colour, a tensor of one number too, ``()`` or ``(1,)``: gradients flow to it.
     Values that are neither, and names that the scene has not, are returned unchanged: :meth:`Scene.check` refuses them.
     """
-    return {name: _as_tensor(scene, name, value) if name in scene.tensors else value for name, value in params.items()}
+    return {
+        name: _as_tensor(scene, name, value) if name in scene.raw_params else value for name, value in params.items()
+    }
 
 
 def _as_tensor(scene: Scene, name: str, value: Any) -> Any:
-    own, spec, is_tensor = scene.tensors[name], scene.spec(name), isinstance(value, Tensor)
+    own, spec, is_tensor = scene.raw_params[name], scene.spec(name), isinstance(value, Tensor)
     if not is_tensor:
         if isinstance(value, str) and isinstance(spec, Index):  # the name of a medium
             value = _number_of(spec, name, value)
@@ -95,7 +97,7 @@ def validate_changes(scene: Scene, validated_versions: dict[str, int]) -> None:
         SceneError: see :meth:`Scene.check_own`.
     """
     loaded = scene.built.parameters
-    for name in loaded.keys() ^ scene.tensors.keys():  # names in one of the two: removed or added
+    for name in loaded.keys() ^ scene.raw_params.keys():  # names in one of the two: removed or added
         raise SceneError(
             f"params.{name}", "nothing" if name in loaded else name, "the names that the scene was loaded with"
         )
@@ -103,7 +105,7 @@ def validate_changes(scene: Scene, validated_versions: dict[str, int]) -> None:
     if not changed:
         return
     for name in changed:
-        value = scene.tensors[name]
+        value = scene.raw_params[name]
         check_tensor(name, value, loaded[name].shape)
         scene.check_number(name, value.detach())
     merged = scene.merged(None)  # the scene's own parameters
@@ -119,5 +121,5 @@ def inherited_checks(made: Scene, scene: Scene, validated_versions: dict[str, in
     return {
         name: version
         for name, version in now.items()
-        if 0 < before.get(name, 0) == validated_versions.get(name) and made.tensors[name] is scene.tensors[name]
+        if 0 < before.get(name, 0) == validated_versions.get(name) and made.raw_params[name] is scene.raw_params[name]
     }

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from torchpt.compiler.cache import note_unasked
 from torchpt.compiler.form import CAPACITY, VECTORS
 from torchpt.compiler.kernel import HEAD, WORD
 from torchpt.core.memory import Budget, explain_out_of_memory, is_out_of_memory, on_low_memory
@@ -145,6 +146,12 @@ class KernelsForward:
             True if all samples were rendered.
         """
         self.kernels.prefetch(self.budget.threads)
+        complete = self._run(spans, each)
+        if complete:
+            note_unasked()
+        return complete
+
+    def _run(self, spans: Sequence[tuple[PixelSet, int, int]], each: Callable[[TaskResult | None], bool]) -> bool:
         integrator = self.kernels.wave.integrator
         if not integrator.merging_counts:
             return self.take(self.blocks(spans, self.budget.threads * TASKS), each)

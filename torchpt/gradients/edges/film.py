@@ -148,7 +148,7 @@ class FilmMap:
 
     def rays(self, s: Tensor, lens: Tensor | None) -> tuple[Tensor, Tensor]:
         """Return rays through places ``s (2, N)``, as :meth:`torchpt.physics.cameras.Camera.rays`."""
-        if not isinstance(self._camera, Perspective):
+        if lens is not None or not isinstance(self._camera, Perspective):
             return self._camera.rays(s[0], s[1], lens)
         d = self._ways @ torch.cat((s, torch.ones_like(s[:1])))
         return self._camera.origin(), d / dot(d, d).sqrt()

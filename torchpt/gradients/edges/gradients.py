@@ -66,7 +66,7 @@ def concerns(scene: Scene, names: Iterable[str]) -> bool:
 def samples_for(scene: Scene, names: Iterable[str], spp: int, pixels: int) -> float:
     """Return how many samples a pixel each estimator takes beside ``spp`` of the backward pass, by what is differentiated."""
     moving = [name for name in names if concerns(scene, (name,))]
-    vertices = [scene.tensors[name].numel() // 3 for name in moving if name.endswith(".vertices")]
+    vertices = [scene.raw_params[name].numel() // 3 for name in moving if name.endswith(".vertices")]
     if not vertices:
         return spp / (_PER_EDGE_SAMPLE_OF_MANY if spp * pixels >= _MANY else _PER_EDGE_SAMPLE)
     meshes = len(vertices) == len(moving) and min(vertices) >= _MESH

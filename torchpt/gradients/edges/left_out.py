@@ -27,12 +27,12 @@ def left_out(scene: Scene, settings: Settings, params: Mapping[str, Tensor] | No
 
     ``params``: those that replace the scene's.
     """
-    return list(_found(scene, settings, scene.merged(params)))
+    return list(_found(scene, settings, scene.readable_params(params)))
 
 
 def _found(scene: Scene, settings: Settings, params: Mapping[str, Tensor]) -> Iterator[str]:
     built, camera = scene.built, scene.description.camera.kind
-    if scene.camera(settings.film, scene.tensors, torch.float64).film_of(_point(scene.device)) is None:
+    if scene.camera(settings.film, scene.raw_params, torch.float64).film_of(_point(scene.device)) is None:
         yield f"those that a camera of kind {camera.name} sees"
     materials = [owner.material for owner in (*built.parts, *built.copies)]
     if any(is_mirror(part, params) for material in materials for part in material.with_inner()):

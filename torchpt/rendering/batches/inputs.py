@@ -191,7 +191,7 @@ def params_of(params: Any, scenes: Scene | Iterable[Scene]) -> Sequence[Params] 
             if not isinstance(value, Tensor) or value.dim() < 1 or not len(value):
                 found = tuple(value.shape) if isinstance(value, Tensor) else value
                 raise SceneError(f"params.{name}", found, "a tensor whose first dimension is the number of scenes")
-            own = scenes.tensors.get(name) if isinstance(scenes, Scene) else None
+            own = scenes.raw_params.get(name) if isinstance(scenes, Scene) else None
             if own is not None and value.dim() <= own.dim():
                 expected = f"a first dimension that is the number of scenes, before those of {tuple(own.shape)}"
                 raise SceneError(f"params.{name}", tuple(value.shape), expected)

@@ -48,7 +48,7 @@ def load_stl(path: Path, data: bytes, materials: bool) -> list[MeshPart]:
 def _ascii(path: Path, data: bytes) -> NDArray[np.float64]:
     """Return the corners ``(3 F, 3)`` of an ASCII file."""
     # The rest of these lines is a name, of any words; a file on one line has none.
-    unnamed = re.sub(rb"(?im)^([ \t]*(?:end)?solid\b)[^\r\n]*", rb"\1", data)
+    unnamed = re.sub(rb"(?im)(^|(?<=\r))([ \t]*(?:end)?solid\b)[^\r\n]*", rb"\2", data)
     words = (unnamed if b"vertex" in unnamed.lower() else data).split()
     keys = [word.lower() for word in words]  # writers differ in case
     if b"endsolid" not in keys:

@@ -105,8 +105,9 @@ class ParameterReads(TexelSource):
     def __getitem__(self, name: str) -> Tensor:
         if self._reads:
             self._reads[-1].add(name)
-        if name in self._packed:
-            return torch.from_numpy(self._packed[name].values())
+        image = self._packed.get(name)
+        if image is not None and not image.has_numbers:
+            return torch.from_numpy(image.values())
         state = None if self._kept is None or name in self._own else self._state(name)
         if state is None:
             return self._parameters[name]

@@ -144,6 +144,7 @@ class Image(Mapped):
         )
         if isinstance(texels, ByteImage):
             texels.needs_floats |= not node.packed  # levels of mipmaps and luminances are no bytes
+            texels.is_read_packed |= node.packed
         return node
 
 
