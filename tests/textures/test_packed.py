@@ -112,7 +112,7 @@ def test_numbers_are_those_of_the_image(channels, encoded):
     tensor = torch.empty(of_bytes.shape)
     images = PackedImages({"a": of_bytes}, {"a": tensor})
     version = tensor._version
-    assert np.array_equal(images.found()["a"].values(), expected)
+    assert np.array_equal(images.found()["a"].image.values(), expected)
     assert images.unpack() and not images.unpack()
     assert np.array_equal(tensor.numpy(), expected) and tensor._version == version and not images.found()
 

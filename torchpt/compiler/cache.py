@@ -298,11 +298,10 @@ def note_unasked() -> None:
 
     They are of models that no or few paths hit, in scenes of this structure. Later processes do not trace them in vain.
     """
-    with _tracing:
-        for _, _, disk_key in _begun.values():
-            if disk_key not in _noted:
-                _noted.add(disk_key)
-                cache.write(f"{disk_key}.unasked", b"")
+    for _, _, disk_key in list(_begun.values()):  # without the lock: another thread may be compiling for a while
+        if disk_key not in _noted:
+            _noted.add(disk_key)
+            cache.write(f"{disk_key}.unasked", b"")
 
 
 def compile_stage(stage: TracedStage, target: Target | None = None) -> Program:

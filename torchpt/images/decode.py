@@ -169,6 +169,7 @@ def _check_size(
 
 #: Pixels as they are to be seen from those of a file, by its orientation (TIFF 6.0).
 _UPRIGHT: dict[int, Callable[[NDArray[Any]], NDArray[Any]]] = {
+    1: lambda x: x,
     2: np.fliplr,
     3: lambda x: np.rot90(x, 2),
     4: np.flipud,
@@ -188,12 +189,6 @@ def _decode_by_oiio(source: Path | EncodedImage, label: str, ending: str, stored
             return _decode_by_oiio(Path(file.name), label, ending, stored, max_pixels)
     import OpenImageIO as oiio
 
-    def upright(values: NDArray[Any]) -> NDArray[Any]:
-        """Return pixels as they are to be seen: Radiance files may have them in any order."""
-        return (
-            _UPRIGHT.get(spec.get_int_attribute("Orientation", 1), lambda x: x)(values) if ending == ".hdr" else values
-        )
-
     options = oiio.ImageSpec()
     options.attribute("oiio:UnassociatedAlpha", 1)  # a PNG's colours as stored, not multiplied by alpha
     options.attribute("oiio:RawColor", 1)  # nor converted to another colour space
@@ -202,6 +197,8 @@ def _decode_by_oiio(source: Path | EncodedImage, label: str, ending: str, stored
         raise AssetError(label, f"cannot be read ({oiio_error(oiio) or 'unknown format'})")
     try:
         spec = picture.spec()
+        # Radiance files may have their pixels in any order.
+        upright = _UPRIGHT[spec.get_int_attribute("Orientation", 1) if ending == ".hdr" else 1]
         if spec.deep:
             raise AssetError(label, "holds deep pixels, which are not read")
         _check_size(label, spec.width, spec.height, spec.nchannels, max_pixels)

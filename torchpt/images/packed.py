@@ -1,7 +1,7 @@
 """Images of 8 bits a value that stay so in memory: a texel is one number of 32 bits, decoded where it is read.
 
-A texel takes 4 bytes, where a colour in float32 takes 12. The numbers have their place all the same, as a
-tensor that anyone may ask for, but nothing is written there, and so no memory is taken, before someone does.
+A texel takes 4 bytes, where a colour in float32 takes 12. The numbers have their place all the same, as a tensor that
+anyone may ask for, but nothing is written there, and so no memory is taken, before someone does.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from torchpt.images.texels import ByteImage, decoded_bytes
@@ -32,26 +31,14 @@ class PackedTexels:
     Attributes:
         words: ``(T,)`` int32, the texels of all images: the first channel in the lowest byte.
         first: number of its first texel there.
-        height: H.
-        width: W.
-        channels: C, from 1 to 4.
-        encoded: True: colours are decoded from sRGB. The last of 2 or 4 channels, alpha, is not.
-        stored: ``(H, W, C)`` uint8, the same memory.
+        image: the image, its bytes in the same memory.
         has_numbers: True: the tensor of the image has its numbers too.
     """
 
     words: Tensor
     first: int
-    height: int
-    width: int
-    channels: int
-    encoded: bool
-    stored: NDArray[np.uint8]
+    image: ByteImage
     has_numbers: bool
-
-    def values(self) -> NDArray[np.float32]:
-        """Return the texels ``(H, W, C)``, decoded."""
-        return ByteImage(self.stored, self.encoded).values()
 
 
 class PackedImages:
@@ -61,9 +48,6 @@ class PackedImages:
         images: the images by name.
         tensors: ``(H, W, C)`` float32 each, by name; not written to before :meth:`unpack`. Images without one have their
             numbers elsewhere.
-
-    Attributes:
-        pending: True until images are unpacked.
     """
 
     def __init__(self, images: Mapping[str, ByteImage], tensors: Mapping[str, Tensor]) -> None:
@@ -78,12 +62,16 @@ class PackedImages:
             for k in range(channels):  # one by one: several times faster than texel by texel
                 bytes_of[first : first + sizes[name], k] = image.stored[..., k].reshape(-1)
             stored = bytes_of[first : first + sizes[name], :channels].reshape(height, width, channels)
-            self._found[name] = PackedTexels(
-                words, first, height, width, channels, image.encoded, stored, has_numbers=name not in tensors
-            )
+            packed = ByteImage(stored, image.encoded)
+            self._found[name] = PackedTexels(words, first, packed, has_numbers=name not in tensors)
             first += sizes[name]
         self._arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
-        self._lock, self.pending = threading.Lock(), bool(images)
+        self._lock = threading.Lock()
+
+    @property
+    def pending(self) -> bool:
+        """Return True until images are unpacked."""
+        return bool(self._found)
 
     def found(self) -> Mapping[str, PackedTexels]:
         """Return the images by name; none once they are unpacked."""
@@ -93,6 +81,6 @@ class PackedImages:
         """Write the numbers of all images to their tensors; return False if that was done before."""
         with self._lock:
             for name, array in self._arrays.items() if self._found else ():
-                array[...] = self._found[name].values()  # which torch does not count as a change of the tensor
-            unpacked, self._found, self.pending = bool(self._found), {}, False
+                array[...] = self._found[name].image.values()  # which torch does not count as a change of the tensor
+            unpacked, self._found = self.pending, {}
             return unpacked

@@ -252,7 +252,11 @@ def has_alpha(source: str | PathLike[str] | EncodedImage) -> bool:
         import OpenImageIO as oiio
 
         picture = oiio.ImageInput.open(str(source))
-        return picture is not None and "A" in picture.spec().channelnames
+        if picture is None:
+            return False
+        names = picture.spec().channelnames
+        picture.close()
+        return "A" in names
     if not data.startswith(b"\x89PNG\r\n\x1a\n"):
         name = f".{source.kind}" if isinstance(source, EncodedImage) else str(source)
         # Bytes 2 and 16 of a TGA: the kind, here grey, and bits a pixel.

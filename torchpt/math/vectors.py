@@ -121,13 +121,13 @@ def side_by_side(table: Tensor) -> Tensor:
     return table if table.shape[1] < _COLUMNS else table.T.contiguous().T
 
 
-T = TypeVar("T")
-
-
 def lanes_of(mask: Tensor) -> Tensor | None:
     """Return the lanes ``(n,)`` where a mask is True; None, which :func:`take` knows as all of them, where it is everywhere."""
     index = mask.nonzero().squeeze(1)
     return None if index.shape[0] == mask.shape[0] else index
+
+
+T = TypeVar("T")
 
 
 def rows(record: T, index: Tensor | None) -> T:

@@ -152,6 +152,7 @@ class KernelsForward:
         return complete
 
     def _run(self, spans: Sequence[tuple[PixelSet, int, int]], each: Callable[[TaskResult | None], bool]) -> bool:
+        """Render samples ``first, count`` of sets of pixels; with merging, sample by sample. Return False if halted."""
         integrator = self.kernels.wave.integrator
         if not integrator.merging_counts:
             return self.take(self.blocks(spans, self.budget.threads * TASKS), each)

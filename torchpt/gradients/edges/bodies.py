@@ -211,6 +211,7 @@ class Bodies:
 
 
 def _size(p0: Tensor, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+    """Return sums ``(3, N)`` of the absolute coordinates of an origin and three axes."""
     return p0.abs() + x.abs() + y.abs() + z.abs()
 
 

@@ -342,6 +342,7 @@ class SegmentSamples:
 
     @cached_property
     def _motions(self) -> Motions:
+        """Return the derivatives of what samples count by motions of what their segments touch."""
         edge, ends, receivers = torch.zeros_like(self.r), [torch.zeros_like(self.r) for _ in self.sides], list[Tensor]()
         turns = [side.sign * (1.0 - side.share) * self.r / side.r for side in self.sides]
         for prefix, light in self.prefixes:

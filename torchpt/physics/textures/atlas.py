@@ -222,11 +222,12 @@ def _packed_atlas_of(
     """Build the atlas of nodes whose images are packed, all in the same memory; arguments as for :func:`atlas_of`."""
     layouts = []
     for node in nodes:
-        image, channel = images[node.texels], node.channel or 0
-        step = 8 if node.channel is None and image.channels >= 3 else 0
-        alpha = image.channels in (2, 4) and node.channel == image.channels - 1
-        place = [8 * channel, 256 if image.encoded and not alpha else 0]
-        layouts.append([image.first, 1, step, image.width, image.height, *_modes(node), *place])
+        packed, channel = images[node.texels], node.channel or 0
+        height, width, channels = packed.image.shape
+        step = 8 if node.channel is None and channels >= 3 else 0
+        alpha = channels in (2, 4) and node.channel == channels - 1
+        place = [8 * channel, 256 if packed.image.encoded and not alpha else 0]
+        layouts.append([packed.first, 1, step, width, height, *_modes(node), *place])
     return Atlas(
         texels=images[nodes[0].texels].words.to(device),
         layouts=torch.tensor(layouts, dtype=torch.int64, device=device).T.contiguous(),

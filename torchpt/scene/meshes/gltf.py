@@ -187,6 +187,7 @@ class _Scene:
             index = read(primitive["indices"], "SCALAR").astype(np.int64).reshape(-1)
         else:
             index = np.arange(len(vertices))
+        faces = _triangles(index, mode, self.path)
         label = str(mesh.get("name") or node.get("name") or "")[:80]
         label = label if len(mesh["primitives"]) == 1 else f"{label}{number}"
         ignored = [str(name) for name in attributes if name not in (*_ATTRIBUTES, "TANGENT", "JOINTS_0", "WEIGHTS_0")]
@@ -198,13 +199,12 @@ class _Scene:
         material: FileMaterial | None = None
         if materials:
             material, colors = self.materials.convert(primitive.get("material"), colors)
-            block = self.json.get("materials", [])[primitive["material"]] if "material" in primitive else {}
+            block = self.document.item("materials", primitive["material"]) if "material" in primitive else {}
             translucent = block.get("alphaMode", "OPAQUE") != "OPAQUE"
             if translucent and rgba is not None and rgba.shape[1] == 4 and (rgba[:, 3] < 1.0).any():
                 ignored.append("COLOR_0 (its alpha)")
-            if "normalTexture" in block and uvs is not None and _any_mirrored(uvs, _triangles(index, mode, self.path)):
+            if "normalTexture" in block and uvs is not None and _any_mirrored(uvs, faces):
                 ignored.append("normalTexture (its green channel where texture coordinates are mirrored)")
-        faces = _triangles(index, mode, self.path)
         return MeshPart(
             name=label,
             vertices=vertices,

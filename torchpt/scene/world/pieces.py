@@ -107,7 +107,7 @@ class ParameterReads(TexelSource):
             self._reads[-1].add(name)
         image = self._packed.get(name)
         if image is not None and not image.has_numbers:
-            return torch.from_numpy(image.values())
+            return torch.from_numpy(image.image.values())
         state = None if self._kept is None or name in self._own else self._state(name)
         if state is None:
             return self._parameters[name]
